@@ -1,0 +1,1919 @@
+"""Fac-TDMPC in NumPy: a factored world model for robot planning, in one file.
+
+A TD-MPC expert (encoder, dynamics, reward, value; planning by MPPI in latent space) is distilled
+into a student whose latent state, dynamics, reward and value fall apart into one small model for
+each action dimension. Each joint then plans alone: many times cheaper, in parallel, with the same
+return. This file holds the method whole: networks with hand-written gradients, Adam, Algorithm 1
+(Equation 4), MPPI (Equations 2 and 3), planning workers, environments, and the command line.
+PyTorch is needed only to train new experts (data/train_expert.py).
+
+    python fac_tdmpc_ref.py distill --task reacher-hard
+    python fac_tdmpc_ref.py evaluate --task reacher-hard --model runs/reacher-hard-0/student.npz
+
+The one idea that keeps it small: every model carries an agent axis N, and a centralized model is
+the case N = 1. There is one world model, one planner, one loss. The axes, everywhere:
+
+    N   agents: 1 in TD-MPC; dim(A), or any divisor of it, in Fac-TDMPC
+    m   latent features of an agent
+    d   action dimensions of an agent: dim(A) / N
+    O   observation features;   A = N * d   action dimensions
+    B   batch;   S   action sequences (both always the last axis)
+    K   noise samples of the distillation loss (behind B)
+    H   horizon;   L   steps of a sequence (H + 1 in Equations 2 and 4)
+
+A layer is W (N, out, in), b (N, out, 1) and computes W @ x + b on x (N, in, B): samples last, so
+that activations run over long contiguous rows, and a torch Linear.weight goes in as weight[None].
+Rewards and values come out as (N, B), agent i's share; the global one is their sum over N.
+
+Read it from top to bottom: 1 configuration, 2 layers, 3 world model, 4 Equation 1 (to come),
+5 distillation, 6 planning, 7 environments, 8 data, 9 experiments and command line. Departures
+from the paper are tagged [D1], [D2], ...; the README lists them with what each bought.
+"""
+from __future__ import annotations
+
+import argparse
+import contextlib
+import csv
+import dataclasses
+import difflib
+import functools
+import json
+import multiprocessing
+import multiprocessing.connection
+import os
+import signal
+import sys
+import tempfile
+import time
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+F32 = np.float32
+
+
+class UserError(Exception):
+    """Something the user can mend: printed as one line, exit status 2."""
+
+
+# ======================================================================================
+# 1. Configuration
+# ======================================================================================
+
+
+def field(default, help, paper=None, choices=None):
+    """A dataclass field with its help text; `paper` is the paper's value where ours departs."""
+    return dataclasses.field(default=default, metadata={
+        "help": help, "paper": paper, "choices": choices})
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Sizes of a world model. Raises UserError if the agents don't share the actions evenly."""
+    dim_obs: int = field(0, "O: observation features")
+    dim_action: int = field(0, "A: action dimensions")
+    num_agents: int = field(1, "N: 1 is TD-MPC, A is Fac-TDMPC")
+    latent_dim: int = field(50, "m: latent features of an agent (Table 2)")
+    enc_dim: int = field(256, "hidden width of the encoder (Table 2)")
+    mlp_dim: int = field(512, "hidden width of an agent's other networks (Table 2)")
+    expert_latent_dim: int = field(0, "features of the expert's latent, where the trained encoder "
+                                   "reads that; 0: it reads the observation")
+    expert_enc_dim: int = field(256, "hidden width of the frozen expert encoder below it")
+
+    def __post_init__(self):
+        if self.num_agents < 1:
+            raise UserError(f"the number of agents must be one of {divisors(self.dim_action)}, "
+                            f"not {self.num_agents}")
+        if self.dim_action % self.num_agents:
+            raise UserError(f"{self.dim_action} action dimensions can't be shared by "
+                            f"{self.num_agents} agents; N may be one of {divisors(self.dim_action)}")
+
+    @property
+    def agent_actions(self):
+        """d: action dimensions of one agent."""
+        return self.dim_action // self.num_agents
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """MPPI. Raises UserError for values that can't plan."""
+    samples: int = field(512, "S: action sequences drawn in an iteration (Table 2)")
+    iterations: int = field(6, "refinements of the proposal in a decision (Table 2)")
+    elites: int = field(0, "sequences that refine the proposal; 0: samples / 8, Table 2's 64 of 512")
+    pi_trajs: int = field(24, "policy proposals, where the model has a policy (Table 2)")
+    horizon: int = field(3, "H: rewards that are summed before Q (Table 2)")
+    value_at: str = field("after", "where Q ends the return: after (Equation 2: H rewards, then Q "
+                          "of action H + 1) or last (authors' code: Q of action H)",
+                          choices=("after", "last"))
+    discount: float = field(0.99, "gamma (Table 2)")
+    min_std: float = field(0.05, "smallest sampling deviation (Table 2)")
+    max_std: float = field(2.0, "first and largest sampling deviation (Table 2)")
+    temperature: float = field(0.5, "an elite weighs exp(temperature * return) (Table 2)")
+    momentum: float = field(0.1, "share of the old mean that is kept (TD-MPC's code)")
+    output: str = field("sampled", "the action: sampled from the elites by weight (TD-MPC's code) "
+                        "or their weighted mean (the paper's text)", choices=("sampled", "mean"))
+
+    def __post_init__(self):
+        if self.elites == 0:
+            object.__setattr__(self, "elites", max(1, self.samples // 8))
+        for name in ("samples", "iterations", "elites", "horizon"):
+            if getattr(self, name) < 1:
+                raise UserError(f"planner: {name} must be at least 1, not {getattr(self, name)}")
+        if self.elites > self.samples:
+            raise UserError(f"planner: {self.elites} elites can't be chosen from {self.samples} "
+                            f"samples; lower elites or raise samples")
+        if not 0 < self.min_std <= self.max_std:
+            raise UserError(f"planner: needs 0 < min_std <= max_std, not {self.min_std}, "
+                            f"{self.max_std}")
+        check_choices(self)
+
+    @property
+    def rewards(self):
+        """Rewards in the return; the sequence has one action more, which only Q sees."""
+        return self.horizon if self.value_at == "after" else self.horizon - 1
+
+
+@dataclass(frozen=True)
+class DistillConfig:
+    """Algorithm 1. `--preset paper` takes each field's paper value."""
+    steps: int = field(12_000, "gradient steps [D1]", paper=100_000)
+    batch_size: int = field(16, "B: states in a step [D1]", paper=512)
+    noise_samples: int = field(10, "K: perturbations of each action (section 4.4)")
+    noise_std: float = field(0.5, "deviation of the perturbations (authors' code)")
+    horizon: int = field(3, "H: steps of the latent rollout (Table 2)")
+    final_term: bool = field(True, "sum over h = 0..H as printed; off: 0..H-1 as the authors' code")
+    lam: float = field(0.5, "lambda: weight of step h is lambda^h (rho in Table 2)")
+    reward_coef: float = field(0.5, "weight of the rewards' divergence (Table 2)")
+    value_coef: float = field(0.1, "weight of each Q's divergence (Table 2)")
+    temperature_student: float = field(0.5, "T_s of Equation 4 (authors' code)")
+    temperature_expert: float = field(0.5, "T_e (authors' code)")
+    kl: str = field("forward", "forward: D(expert || student), as Hinton and Rusu distil; reverse: "
+                    "D(student || expert), Algorithm 1's order of arguments [D2]",
+                    paper="reverse", choices=("forward", "reverse"))
+    encoder_input: str = field("latent", "the student's encoder reads the observation, or the "
+                               "expert's latent [D3]", paper="observation",
+                               choices=("latent", "observation"))
+    lr: float = field(1e-3, "Adam's learning rate [D1]", paper=1e-4)
+    lr_schedule: str = field("cosine", "cosine (to zero) or constant [D1]", paper="constant",
+                             choices=("cosine", "constant"))
+    warmup: int = field(200, "steps over which lr rises from zero [D1]", paper=0)
+    grad_clip: float = field(10.0, "largest gradient norm (Table 2)")
+    sizes: str = field("table2", "agent sizes: table2 (m = 50) or section51 (m = 512 // N)",
+                       choices=("table2", "section51"))
+    held_out: float = field(0.05, "share of episodes kept for the rank correlation")
+
+    def __post_init__(self):
+        for name in ("steps", "batch_size", "horizon"):
+            if getattr(self, name) < 1:
+                raise UserError(f"distillation: {name} must be at least 1, not {getattr(self, name)}")
+        if self.noise_samples < 2:
+            raise UserError(f"distillation: noise_samples must be at least 2 to be ranked, not "
+                            f"{self.noise_samples}")
+        for name in ("noise_std", "temperature_student", "temperature_expert", "lr", "grad_clip"):
+            if not getattr(self, name) > 0:
+                raise UserError(f"distillation: {name} must be above 0, not {getattr(self, name)}")
+        if not 0 < self.held_out < 1:
+            raise UserError(f"distillation: held_out must lie between 0 and 1, not {self.held_out}")
+        check_choices(self)
+
+
+@dataclass(frozen=True)
+class ExpertConfig:
+    """TD-MPC's training (Equation 1), used by data/train_expert.py."""
+    latent_dim: int = field(50, "m: latent features (Table 2)")
+    enc_dim: int = field(256, "hidden width of the encoder (Table 2)")
+    mlp_dim: int = field(512, "hidden width of the other networks (Table 2)")
+    horizon: int = field(3, "H: steps of the latent rollout (Table 2)")
+    batch_size: int = field(512, "segments in an update (Table 2)")
+    updates_per_step: float = field(1.0, "updates for each decision")
+    lr: float = field(5e-4, "Adam's learning rate (authors' expert)")
+    discount: float = field(0.99, "gamma (Table 2)")
+    lam: float = field(0.5, "lambda of Equation 1 (rho in Table 2)")
+    consistency_coef: float = field(2.0, "weight of the latent term (TD-MPC)")
+    reward_coef: float = field(0.5, "weight of the reward term (Table 2)")
+    value_coef: float = field(0.1, "weight of the value term (Table 2)")
+    grad_clip: float = field(10.0, "largest gradient norm (Table 2)")
+    tau: float = field(0.01, "step of the moving-average targets (Table 2)")
+    target_every: int = field(2, "updates between two steps of the targets (TD-MPC)")
+    std_start: float = field(0.5, "smallest sampling deviation at the start (TD-MPC)")
+    std_steps: int = field(25_000, "decisions over which it falls to the planner's min_std")
+    seed_decisions: int = field(4_000, "random decisions before the first update")
+    buffer_size: int = field(1_000_000, "replay capacity, transitions (Table 2)")
+
+
+def divisors(n):
+    """The numbers of agents that can share n action dimensions."""
+    return [i for i in range(1, n + 1) if n % i == 0]
+
+
+def check_choices(config):
+    """Raise UserError if a field with choices holds something else."""
+    for f in dataclasses.fields(config):
+        value, choices = getattr(config, f.name), f.metadata["choices"]
+        if choices and value not in choices:
+            raise UserError(f"{f.name} must be one of {', '.join(choices)}, not {value!r}")
+
+
+def from_dict(config_class, values, where):
+    """A config from a dict, e.g. a file's header; unknown keys are refused."""
+    known = [f.name for f in dataclasses.fields(config_class)]
+    for key in values:
+        if key not in known:
+            raise UserError(f"{where}: unknown setting {key!r}; expected some of {', '.join(known)}")
+    return config_class(**values)
+
+
+def student_config(expert, num_agents, sizes, encoder_input):
+    """A student's ModelConfig: Table 2's or section 5.1's latent; hidden max(512 // N, 50)."""
+    latent = 50 if sizes == "table2" or num_agents < 1 else 512 // num_agents
+    config = ModelConfig(expert.dim_obs, expert.dim_action, num_agents, latent, 256)
+    config = dataclasses.replace(config, mlp_dim=max(512 // num_agents, 50))
+    if encoder_input == "observation":
+        return config
+    return dataclasses.replace(config, expert_latent_dim=expert.num_agents * expert.latent_dim,
+                               expert_enc_dim=expert.enc_dim)
+
+
+# ======================================================================================
+# 2. Layers: each forward beside its backward
+# ======================================================================================
+
+# Networks of TD-MPC's TOLD as layer kinds. A layer's place is its index in the official state
+# dict: layer 3 of the first Q is `_Q1.3.weight`, `_Q1.3.bias`.
+ENCODER = ("linear", "elu", "linear")
+MLP = ("linear", "elu", "linear", "elu", "linear")
+QNET = ("linear", "norm", "tanh", "linear", "elu", "linear")
+NORM_EPS = 1e-5  # PyTorch's LayerNorm
+
+
+class Arena:
+    """Hands out arrays as np.empty does, the same ones in the same order after each `rewind`.
+
+    A training step asks for the same shapes every time; fresh megabytes would cost page faults.
+    """
+
+    def __init__(self):
+        self._arrays, self._next = [], 0
+
+    def rewind(self):
+        """Start over: whatever was handed out before may be overwritten from now on."""
+        self._next = 0
+
+    def empty(self, shape, dtype):
+        """An array of this shape and dtype with arbitrary contents."""
+        if self._next == len(self._arrays):
+            self._arrays.append(None)
+        kept = self._arrays[self._next]
+        if kept is None or kept.shape != shape or kept.dtype != dtype:
+            kept = self._arrays[self._next] = np.empty(shape, dtype)
+        self._next += 1
+        return kept
+
+
+# Every function takes `empty`: where its outputs live, np.empty or an Arena's.
+
+def linear(x, W, b, empty=np.empty):
+    """y = W x + b.  x (N, in, B), W (N, out, in), b (N, out, 1) -> (N, out, B)."""
+    y = np.matmul(W, x, out=empty((*W.shape[:2], x.shape[2]), x.dtype))
+    y += b
+    return y
+
+
+def linear_backward(dy, x, W, empty=np.empty):
+    """Gradients of y = W x + b: dx = W^T dy, dW = dy x^T, db = sum over B of dy."""
+    dx = np.matmul(W.swapaxes(1, 2), dy, out=empty(x.shape, x.dtype))
+    dW = np.matmul(dy, x.swapaxes(1, 2), out=empty(W.shape, x.dtype))
+    return dx, dW, dy.sum(2, keepdims=True)
+
+
+def _zeros_row(x):
+    return np.zeros(x.shape[-1], x.dtype)  # minimum(x, row of zeros) is 4 times minimum(x, 0)
+
+
+def elu(x, empty=np.empty):
+    """y = x where x > 0, else exp(x) - 1. As a maximum, since exp(x) - 1 >= x."""
+    y = np.minimum(x, _zeros_row(x), out=empty(x.shape, x.dtype))
+    np.expm1(y, out=y)
+    return np.maximum(x, y, out=y)
+
+
+def elu_backward(dy, y):
+    """y = elu(x): dy/dx is 1 where y > 0, else exp(x) = y + 1. Overwrites y with dx."""
+    np.minimum(y, _zeros_row(y), out=y)
+    y += 1
+    y *= dy
+    return y
+
+
+def tanh_backward(dy, y):
+    """y = tanh(x): dy/dx = 1 - y^2. Overwrites y with dx."""
+    y *= y
+    np.subtract(1, y, out=y)
+    y *= dy
+    return y
+
+
+def standardize(x, empty=np.empty):
+    """x_hat = (x - mean) / sqrt(var + eps) over the features of each agent; also 1 / sqrt."""
+    x_hat = np.subtract(x, x.mean(1, keepdims=True), out=empty(x.shape, x.dtype))
+    var = np.einsum("nfb,nfb->nb", x_hat, x_hat)[:, None] / x.shape[1]
+    scale = 1 / np.sqrt(var + x.dtype.type(NORM_EPS))
+    x_hat *= scale
+    return x_hat, scale
+
+
+def norm(x, g, b, empty=np.empty):
+    """LayerNorm: y = g x_hat + b.  x (N, F, B), g and b (N, F, 1)."""
+    y, _ = standardize(x, empty)
+    y *= g
+    y += b
+    return y
+
+
+def norm_backward(dy, x, g, empty=np.empty):
+    """Gradients of y = g x_hat + b; dx leaves out what moves the mean or the variance."""
+    x_hat, scale = standardize(x, empty)
+    db = dy.sum(2, keepdims=True)
+    dg = np.einsum("nfb,nfb->nf", dy, x_hat)[:, :, None]
+    dx = np.multiply(dy, g, out=empty(x.shape, x.dtype))
+    x_hat *= np.einsum("nfb,nfb->nb", dx, x_hat)[:, None] / x.shape[1]
+    dx -= dx.mean(1, keepdims=True)
+    dx -= x_hat
+    dx *= scale
+    return dx, dg, db
+
+
+def forward(kinds, params, name, x, tape=None, empty=np.empty):
+    """Run a network on x (N, in, B). A tape (list) keeps x and every layer's output."""
+    if tape is not None:
+        tape.append(x)
+    for i, kind in enumerate(kinds):
+        if kind in ("linear", "norm"):
+            layer = linear if kind == "linear" else norm
+            x = layer(x, params[f"{name}.{i}.weight"], params[f"{name}.{i}.bias"], empty)
+        elif kind == "elu":
+            x = elu(x, empty)
+        else:
+            x = np.tanh(x, out=empty(x.shape, x.dtype))
+        if tape is not None:
+            tape.append(x)
+    return x
+
+
+def backward(kinds, params, name, tape, dy, grads, empty=np.empty):
+    """Walk `forward` back: adds parameter gradients to `grads`, returns dx (N, in, B).
+
+    Uses the tape up: activations are overwritten by gradients on the way.
+    """
+    for i in reversed(range(len(kinds))):
+        kind, x, y = kinds[i], tape[i], tape[i + 1]
+        if kind in ("linear", "norm"):
+            layer_backward = linear_backward if kind == "linear" else norm_backward
+            dy, dW, db = layer_backward(dy, x, params[f"{name}.{i}.weight"], empty)
+            grads[f"{name}.{i}.weight"] += dW
+            grads[f"{name}.{i}.bias"] += db
+        else:
+            dy = elu_backward(dy, y) if kind == "elu" else tanh_backward(dy, y)
+    return dy
+
+
+def orthogonal(rng, agents, rows, columns, dtype=F32):
+    """(N, rows, columns) matrices with orthonormal rows or columns, whichever are fewer."""
+    q, r = np.linalg.qr(rng.standard_normal((agents, max(rows, columns), min(rows, columns))))
+    q *= np.sign(np.diagonal(r, axis1=1, axis2=2))[:, None]  # uniform over rotations
+    return np.ascontiguousarray(q if rows >= columns else q.swapaxes(1, 2), dtype)
+
+
+def flatten(arrays):
+    """One vector that holds all arrays of a dict, and a dict of views into it."""
+    vector = np.concatenate([a.ravel() for a in arrays.values()])
+    ends = np.cumsum([a.size for a in arrays.values()])
+    return vector, {k: vector[end - a.size:end].reshape(a.shape)
+                    for (k, a), end in zip(arrays.items(), ends)}
+
+
+def clip_norm(gradient, largest):
+    """Scale a gradient vector in place so that its norm is at most `largest`; returns the norm."""
+    length = float(np.sqrt(np.dot(gradient, gradient)))
+    if length > largest:
+        gradient *= gradient.dtype.type(largest / (length + 1e-6))  # PyTorch's 1e-6
+    return length
+
+
+class Adam:
+    """Adam as PyTorch defines it (bias corrections outside the root's epsilon)."""
+
+    def __init__(self, size, dtype=F32, betas=(0.9, 0.999), eps=1e-8):
+        self.m, self.v, self._work = (np.zeros(size, dtype) for _ in range(3))
+        self.betas, self.eps, self.t = betas, eps, 0
+
+    def step(self, params, grads, lr):
+        """params -= lr m_hat / (sqrt(v_hat) + eps), in place, on vectors."""
+        self.t += 1
+        beta1, beta2 = self.betas
+        correct1, correct2 = 1 - beta1 ** self.t, 1 - beta2 ** self.t
+        work = self._work
+        self.m *= beta1                                 # m = beta1 m + (1 - beta1) g
+        self.m += np.multiply(grads, 1 - beta1, out=work)
+        np.multiply(grads, grads, out=work)             # v = beta2 v + (1 - beta2) g^2
+        work *= 1 - beta2
+        self.v *= beta2
+        self.v += work
+        np.sqrt(self.v, out=work)
+        work /= correct2 ** 0.5
+        work += self.eps
+        np.divide(self.m, work, out=work)
+        work *= lr / correct1
+        params -= work
+
+
+# ======================================================================================
+# 3. World model (sections 3.2 and 4.2)
+# ======================================================================================
+
+
+class WorldModel:
+    """f_E, f_T, f_R, f_Q with an agent axis: TD-MPC for N = 1, Fac-TDMPC for N = A.
+
+    `params` maps official TD-MPC state-dict names to arrays with a leading agent axis, all of
+    one dtype (float32; float64 only to check gradients). The encoder is centralized (N = 1);
+    `_pi`, the expert's policy, and `_expert_encoder`, the frozen encoder below a student's own,
+    are there for some models only.
+    """
+
+    def __init__(self, config, params):
+        self.config, self.params = config, params
+
+    @classmethod
+    def create(cls, config, rng, policy=False, dtype=F32):
+        """Fresh weights: orthogonal, biases zero, last layer of reward and Q zero (TD-MPC)."""
+        params = {}
+        for name, i, kind, shape, last in layers(config, policy):
+            zero = last and name in ("_reward", "_Q1", "_Q2")
+            params[f"{name}.{i}.weight"] = (
+                np.ones(shape, dtype) if kind == "norm" else
+                np.zeros(shape, dtype) if zero else orthogonal(rng, *shape, dtype))
+            params[f"{name}.{i}.bias"] = np.zeros((*shape[:2], 1), dtype)
+        return cls(config, params)
+
+    def encode(self, obs):
+        """s = f_E(g).  obs (O, B) -> latents (N, m, B)."""
+        return self.encode_features(self.encoder_features(obs))
+
+    def encoder_features(self, obs):
+        """What the trained encoder reads, (1, F, B): the observation or the expert's latent."""
+        x = obs[None]
+        if self.config.expert_latent_dim:
+            x = forward(ENCODER, self.params, "_expert_encoder", x)
+        return x
+
+    def encode_features(self, x, tape=None, empty=np.empty):
+        """The trained encoder on (1, F, B); its output is cut into the agents' latents."""
+        z = forward(ENCODER, self.params, "_encoder", x, tape, empty)
+        return z.reshape(self.config.num_agents, self.config.latent_dim, -1)
+
+    def next(self, z, a):
+        """s' = f_T(s, a).  z (N, m, B), a (N, d, B) -> (N, m, B)."""
+        return forward(MLP, self.params, "_dynamics", np.concatenate([z, a], 1))
+
+    def reward(self, z, a):
+        """r^i = f_R^i(s^i, a^i) -> (N, B); the global reward is the sum over N."""
+        return forward(MLP, self.params, "_reward", np.concatenate([z, a], 1))[:, 0]
+
+    def q(self, z, a):
+        """Both values q^i = f_Q^i(s^i, a^i) -> two (N, B); the global ones are the sums."""
+        x = np.concatenate([z, a], 1)
+        return tuple(forward(QNET, self.params, name, x)[:, 0] for name in ("_Q1", "_Q2"))
+
+    def policy(self, z):
+        """The expert's policy mean, z (1, m, B) -> (1, A, B) in (-1, 1)."""
+        return np.tanh(forward(MLP, self.params, "_pi", z))
+
+    @property
+    def has_policy(self):
+        return "_pi.0.weight" in self.params
+
+    def agents(self, i, j):
+        """The model of agents i..j-1 alone: what a planning worker needs (no encoder)."""
+        if j - i == self.config.num_agents:
+            return self
+        config = dataclasses.replace(self.config, num_agents=j - i,
+                                     dim_action=(j - i) * self.config.agent_actions)
+        return WorldModel(config, {k: np.ascontiguousarray(v[i:j]) for k, v in self.params.items()
+                                   if k.startswith(("_dynamics", "_reward", "_Q"))})
+
+
+def networks(config, policy=False):
+    """(name, layer kinds, agents, widths) of every network of a model."""
+    n, m, hidden = config.num_agents, config.latent_dim, config.mlp_dim
+    joint, latent = m + config.agent_actions, config.expert_latent_dim
+    found = [("_encoder", ENCODER, 1, (latent or config.dim_obs, config.enc_dim, n * m)),
+             ("_dynamics", MLP, n, (joint, hidden, hidden, m)),
+             ("_reward", MLP, n, (joint, hidden, hidden, 1)),
+             ("_Q1", QNET, n, (joint, hidden, hidden, 1)),
+             ("_Q2", QNET, n, (joint, hidden, hidden, 1))]
+    if policy:
+        found.append(("_pi", MLP, n, (m, hidden, hidden, config.agent_actions)))
+    if latent:
+        found.append(("_expert_encoder", ENCODER, 1,
+                      (config.dim_obs, config.expert_enc_dim, latent)))
+    return found
+
+
+def layers(config, policy=False):
+    """(network, index, kind, weight shape, whether it is the last) of every layer with weights."""
+    for name, kinds, agents, widths in networks(config, policy):
+        before, *after = widths
+        for i, kind in enumerate(kinds):
+            if kind == "linear":
+                yield name, i, kind, (agents, after[0], before), i == len(kinds) - 1
+                before, *after = after
+            elif kind == "norm":
+                yield name, i, kind, (agents, before, 1), False
+
+
+# ======================================================================================
+# 4. TD-MPC's objective, Equation 1
+# ======================================================================================
+
+# Its PyTorch form, which trained the experts in data/, is `equation_1` in data/train_expert.py.
+
+
+# ======================================================================================
+# 5. Model distillation (section 4.4, Algorithm 1, Equation 4)
+# ======================================================================================
+
+HEADS = (("_reward", MLP), ("_Q1", QNET), ("_Q2", QNET))
+
+
+def predict(model, z, actions, tapes=None, empty=np.empty):
+    """Roll a model out under perturbed actions: global rewards and both Q at every step.
+
+    z (N, m, B), actions (L, A, B, K) -> three (L, B, K). Every noise sample follows its own
+    trajectory s_{h+1} = f_T(s_h, a_h + eps_h). Columns of x are ordered (L, B, K). A `tapes`
+    dict keeps what the backward pass needs.
+    """
+    steps, _, batch, noise = actions.shape
+    n, m, d = model.config.num_agents, model.config.latent_dim, model.config.agent_actions
+    columns = batch * noise
+    x = empty((n, m + d, steps * columns), z.dtype)
+    x[:, m:] = actions.reshape(steps, n, d, columns).transpose(1, 2, 0, 3).reshape(n, d, -1)
+    x[:, :m, :columns] = np.repeat(z, noise, axis=2)
+    keep = (lambda name: None) if tapes is None else (lambda name: tapes.setdefault(name, []))
+    for h in range(steps - 1):
+        now, after = (slice(i * columns, (i + 1) * columns) for i in (h, h + 1))
+        x[:, :m, after] = forward(MLP, model.params, "_dynamics", x[:, :, now],
+                                  keep(f"_dynamics {h}"), empty)
+    return [forward(kinds, model.params, name, x, keep(name), empty).sum(0)
+            .reshape(steps, batch, noise) for name, kinds in HEADS]
+
+
+def predict_backward(model, tapes, d_outputs, grads, empty=np.empty):
+    """Walk `predict` back from gradients of its three outputs; adds to `grads`, returns dz."""
+    n, m = model.config.num_agents, model.config.latent_dim
+    steps, batch, noise = d_outputs[0].shape
+    columns = batch * noise
+    dx = 0
+    for (name, kinds), d_out in zip(HEADS, d_outputs):
+        # the global output is the sum over agents: each share has the same gradient
+        d_share = np.ascontiguousarray(np.broadcast_to(d_out.reshape(1, 1, -1),
+                                                       (n, 1, steps * columns)))
+        dx = dx + backward(kinds, model.params, name, tapes[name], d_share, grads, empty)
+    for h in reversed(range(steps - 1)):
+        now, after = (slice(i * columns, (i + 1) * columns) for i in (h, h + 1))
+        dx[:, :, now] += backward(MLP, model.params, "_dynamics", tapes[f"_dynamics {h}"],
+                                  np.ascontiguousarray(dx[:, :m, after]), grads, empty)
+    return dx[:, :m, :columns].reshape(n, m, batch, noise).sum(3)
+
+
+def log_softmax(x):
+    """log of exp(x) / sum exp(x) over the last axis."""
+    x = x - x.max(-1, keepdims=True)
+    return x - np.log(np.exp(x).sum(-1, keepdims=True))
+
+
+def soft_kl(student, expert, temperature_student, temperature_expert, kind="forward"):
+    """Equation 4: KL between softmax(expert / T_e) and softmax(student / T_s) over the last axis.
+
+    student, expert (..., K) predictions for the K perturbed actions of a state. Returns the
+    divergence (...) and its gradient with respect to `student` (..., K).
+    """
+    log_s = log_softmax(student / temperature_student)
+    log_e = log_softmax(expert / temperature_expert)
+    p_s, p_e = np.exp(log_s), np.exp(log_e)
+    if kind == "forward":   # sum p_e (log p_e - log p_s); d log p_s,j / d x_k = [j=k] - p_s,k
+        kl = (p_e * (log_e - log_s)).sum(-1)
+        return kl, (p_s - p_e) / temperature_student
+    gap = log_s - log_e     # sum p_s (log p_s - log p_e)
+    kl = (p_s * gap).sum(-1)
+    return kl, p_s * (gap - kl[..., None]) / temperature_student
+
+
+def distill_loss(student, features, actions, targets, config, grads=None, empty=np.empty):
+    """The loss in line 6 of Algorithm 1 and, into the dict `grads`, its gradients.
+
+    features (1, F, B): what the student's encoder reads in the first states; actions
+    (L, A, B, K): a_h + eps_h; targets: the expert's `predict` for them. Returns the loss and
+    the mean divergences of reward and value over steps and states.
+    """
+    tapes, encoder_tape = {}, []
+    z = student.encode_features(features, encoder_tape, empty)
+    outputs = predict(student, z, actions, tapes, empty)
+    steps, batch, _ = outputs[0].shape
+    weights = (config.lam ** np.arange(steps) / batch).astype(z.dtype)[:, None]
+    loss, means, d_outputs = 0.0, [], []
+    coefs = (config.reward_coef, config.value_coef, config.value_coef)
+    for coef, output, target in zip(coefs, outputs, targets):
+        kl, d_output = soft_kl(output, target, config.temperature_student,
+                               config.temperature_expert, config.kl)
+        loss += coef * float((weights * kl).sum())
+        means.append(float(kl.mean()))
+        d_outputs.append(coef * weights[..., None] * d_output)
+    if grads is not None:
+        dz = predict_backward(student, tapes, d_outputs, grads, empty)
+        backward(ENCODER, student.params, "_encoder", encoder_tape,
+                 dz.reshape(1, -1, batch), grads, empty)
+    return loss, means[0], (means[1] + means[2]) / 2
+
+
+class Distiller:
+    """Algorithm 1: one `step` after the other, reproducible from (seed, step) alone.
+
+    The expert's side of the next step runs on a second thread while the student learns from
+    this one: NumPy lets go of the interpreter inside its products, so both cores are busy.
+    """
+
+    def __init__(self, expert, replay, config, num_agents=None, seed=0):
+        sizes = expert.config
+        if (replay.dim_obs, replay.dim_action) != (sizes.dim_obs, sizes.dim_action):
+            raise UserError(f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, "
+                            f"{replay.dim_action}), the expert expects ({sizes.dim_obs}, "
+                            f"{sizes.dim_action}); pass the replay of the expert's task")
+        self.expert, self.config, self.seed, self.t = expert, config, seed, 0
+        agents = sizes.dim_action if num_agents is None else num_agents
+        self.model_config = student_config(sizes, agents, config.sizes, config.encoder_input)
+        student = WorldModel.create(self.model_config, np.random.default_rng([seed, 2 ** 32 - 1]))
+        if config.encoder_input == "latent":
+            student.params.update({"_expert" + k: v for k, v in expert.params.items()
+                                   if k.startswith("_encoder.")})
+        frozen = {k: v for k, v in student.params.items() if k.startswith("_expert")}
+        trained = {k: v for k, v in student.params.items() if k not in frozen}
+        self.vector, views = flatten(trained)  # all weights in a row: Adam is a few vector calls
+        self.student = WorldModel(self.model_config, {**views, **frozen})
+        self.gradient, self._grads = flatten({k: np.zeros_like(v) for k, v in trained.items()})
+        self.adam = Adam(len(self.vector))
+        self.steps = config.horizon + config.final_term
+        self.replay = replay
+        self.train_starts, self.held_out_starts = replay.starts(self.steps, config.held_out)
+        self._teacher, self._next = ThreadPoolExecutor(1), None
+        self._arenas = Arena(), Arena()  # the student's and the teacher's
+
+    def batch(self, t):
+        """Line 4 and the expert's part of step t: features, perturbed actions, targets."""
+        rng = np.random.default_rng([self.seed, t])
+        starts = rng.choice(self.train_starts, self.config.batch_size)
+        self._arenas[1].rewind()
+        return perturbed_batch(self.expert, self.student, self.replay, starts, self.steps,
+                               self.config.noise_samples, self.config.noise_std, rng,
+                               self._arenas[1].empty)
+
+    def learning_rate(self, t):
+        """Linear rise over `warmup` steps, then constant or half a cosine down to zero [D1]."""
+        rate = self.config.lr * min(1.0, (t + 1) / max(1, self.config.warmup))
+        if self.config.lr_schedule == "cosine":
+            rate *= 0.5 * (1 + np.cos(np.pi * min(1.0, t / self.config.steps)))
+        return float(rate)
+
+    def step(self):
+        """Lines 4 to 6 once. Returns loss, mean reward divergence, mean value divergence."""
+        batch = (self._next or self._teacher.submit(self.batch, self.t)).result()
+        self._next = self._teacher.submit(self.batch, self.t + 1)
+        self.gradient[:] = 0
+        self._arenas[0].rewind()
+        losses = distill_loss(self.student, *batch, self.config, self._grads,
+                              self._arenas[0].empty)
+        clip_norm(self.gradient, self.config.grad_clip)
+        self.adam.step(self.vector, self.gradient, self.learning_rate(self.t))
+        self.t += 1
+        return losses
+
+    def state(self):
+        """Everything that a resumed run needs besides its settings."""
+        return {"weights": self.vector, "adam_m": self.adam.m, "adam_v": self.adam.v,
+                "step": np.int64(self.t)}
+
+    def load(self, state):
+        """Go on from a `state`."""
+        self.vector[:], self.adam.m[:], self.adam.v[:] = (state[k] for k in
+                                                          ("weights", "adam_m", "adam_v"))
+        self.t = self.adam.t = int(state["step"])
+        self._next = None
+
+    def close(self):
+        """Stop the teacher's thread."""
+        self._teacher.shutdown(wait=True, cancel_futures=True)
+
+
+def perturbed_batch(expert, student, replay, starts, steps, noise_samples, noise_std, rng,
+                    empty=np.empty):
+    """Features (1, F, B), perturbed actions (L, A, B, K) and expert predictions for `starts`."""
+    obs, actions = replay.sequences(starts, steps)
+    noise = rng.standard_normal((*actions.shape, noise_samples), F32)
+    noise *= noise_std
+    noise += actions[..., None]
+    z = expert.encode(obs)
+    features = z.reshape(1, -1, z.shape[-1])
+    if not student.config.expert_latent_dim:
+        features = obs[None]
+    return features, noise, predict(expert, z, noise, empty=empty)
+
+
+def rank_correlation(student, expert, replay, starts, steps, noise_std, seed, states=128, noise=32):
+    """Spearman's correlation of the global Q (mean of both) over perturbed actions, at each h.
+
+    Mean over `states` states drawn from `starts`; 1 means that the student orders actions as
+    the expert does, which is what the loss asks for (section 4.4). Returns (L,).
+    """
+    from scipy.stats import rankdata
+    rng = np.random.default_rng(seed)
+    starts = rng.choice(starts, states)
+    features, actions, (_, *q_expert) = perturbed_batch(expert, student, replay, starts, steps,
+                                                        noise, noise_std, rng)
+    _, *q_student = predict(student, student.encode_features(features), actions)
+    ranks = [rankdata(q1 + q2, axis=-1) - (noise + 1) / 2
+             for q1, q2 in (q_expert, q_student)]
+    norms = [np.linalg.norm(r, axis=-1) for r in ranks]
+    return ((ranks[0] * ranks[1]).sum(-1) / np.maximum(norms[0] * norms[1], 1e-12)).mean(-1)
+
+
+# ======================================================================================
+# 6. Planning: MPPI (Equations 2 and 3), then the worker processes
+# ======================================================================================
+
+
+def h_step_return(model, z, actions, config):
+    """Equation 2 for every agent, as it reads; `Returns` computes the same faster.
+
+    z (N, m, 1), actions (N, L, d, S) -> G (N, S). Q is the mean of the two: unlike TD-MPC's
+    minimum, a mean of sums is the sum of means, as Proposition 1 needs [D4].
+    """
+    z = np.repeat(z, actions.shape[-1], axis=2)
+    total = 0.0
+    for h in range(config.rewards):
+        total = total + config.discount ** h * model.reward(z, actions[:, h])
+        z = model.next(z, actions[:, h])
+    q1, q2 = model.q(z, actions[:, config.rewards])
+    return total + config.discount ** config.rewards * (q1 + q2) / 2
+
+
+class Returns:
+    """`h_step_return` in kept buffers, a block of samples at a time through the whole horizon.
+
+    Three things make it fast. Networks that share their input share its first product
+    (dynamics with reward; both Q). The latent's part of the first product is computed once,
+    since all samples start from one latent. And LayerNorm's mean is taken out of the weights
+    beforehand: rows that are centred give outputs that are.
+    """
+    BLOCK = 128  # samples; a block's activations stay in the processor's cache
+
+    def __init__(self, model, config):
+        self.config, self.sizes, p = config, model.config, model.params
+
+        def both(a, b):
+            return np.concatenate([p[a], p[b]], 1)
+
+        self.W1 = both("_dynamics.0.weight", "_reward.0.weight")        # (N, 2h, m + d)
+        self.b1 = both("_dynamics.0.bias", "_reward.0.bias")
+        self.second = [(p[f"{n}.2.weight"], p[f"{n}.2.bias"]) for n in ("_dynamics", "_reward")]
+        self.dynamics_out = p["_dynamics.4.weight"], p["_dynamics.4.bias"]
+        self.reward_out = p["_reward.4.weight"], p["_reward.4.bias"]
+        centred = [[p[f"{n}.0.{k}"] - p[f"{n}.0.{k}"].mean(1, keepdims=True)
+                    for n in ("_Q1", "_Q2")] for k in ("weight", "bias")]
+        self.Wq1, self.bq1 = (np.concatenate(pair, 1) for pair in centred)  # (N, 2h, m + d)
+        shape = (model.config.num_agents, 2, model.config.mlp_dim, 1)
+        self.gain, self.shift = (both(f"_Q1.1.{k}", f"_Q2.1.{k}").reshape(shape)
+                                 for k in ("weight", "bias"))
+        self.q_second = [(p[f"{n}.3.weight"], p[f"{n}.3.bias"]) for n in ("_Q1", "_Q2")]
+        self.Wq3 = np.concatenate([p["_Q1.5.weight"], p["_Q2.5.weight"]], 2) / 2  # (N, 1, 2h)
+        self.bq3 = (p["_Q1.5.bias"] + p["_Q2.5.bias"]) / 2
+        self._buffers = {}
+
+    def start(self, z):
+        """Plan from the latent z (N, m, 1): the first products' latent parts."""
+        m = self.sizes.latent_dim
+        self.first = self.W1[:, :, :m] @ z + self.b1
+        self.first_q = self.Wq1[:, :, :m] @ z + self.bq1
+
+    def __call__(self, actions):
+        """actions (N, L, d, S) -> G (N, S)."""
+        samples = actions.shape[-1]
+        width = -(-samples // max(1, round(samples / self.BLOCK)))  # blocks of equal width
+        total = np.zeros((len(actions), samples), F32)
+        for begin in range(0, samples, width):
+            part = slice(begin, min(begin + width, samples))
+            self._block(actions[..., part], total[:, part])
+        return total
+
+    def _make_buffers(self, width):
+        n, m, hidden = self.sizes.num_agents, self.sizes.latent_dim, self.sizes.mlp_dim
+        wide = (n, 2 * hidden, width)
+        return (np.empty((n, m + self.sizes.agent_actions, width), F32),
+                *(np.empty(wide, F32) for _ in range(3)), np.empty((n, 1, width), F32))
+
+    def _block(self, actions, total):
+        width, m, hidden = actions.shape[-1], self.sizes.latent_dim, self.sizes.mlp_dim
+        if width not in self._buffers:
+            self._buffers[width] = self._make_buffers(width)
+        x, y, y2, work, out = self._buffers[width]
+        discount = self.config.discount
+        for h in range(self.config.rewards):
+            x[:, m:] = actions[:, h]
+            self._first(self.W1, self.b1, self.first, h, x, y)
+            _elu(y, work)
+            self._second(self.second, y, y2)
+            _elu(y2, work)
+            np.matmul(self.reward_out[0], y2[:, hidden:], out=out)
+            out += self.reward_out[1]
+            out *= discount ** h
+            total += out[:, 0]
+            np.matmul(self.dynamics_out[0], y2[:, :hidden], out=x[:, :m])
+            x[:, :m] += self.dynamics_out[1]
+        h = self.config.rewards
+        x[:, m:] = actions[:, h]
+        self._first(self.Wq1, self.bq1, self.first_q, h, x, y)
+        self._norm_tanh(y, work)
+        self._second(self.q_second, y, y2)
+        _elu(y2, work)
+        np.matmul(self.Wq3, y2, out=out)
+        out += self.bq3
+        out *= discount ** h
+        total += out[:, 0]
+
+    def _first(self, W, b, start, h, x, y):
+        """First layer; at h = 0 only the action's columns, the latent's share is in `start`."""
+        if h == 0:
+            m = self.sizes.latent_dim
+            np.matmul(W[:, :, m:], x[:, m:], out=y)
+            y += start
+        else:
+            np.matmul(W, x, out=y)
+            y += b
+
+    def _second(self, layers, y, y2):
+        hidden = self.sizes.mlp_dim
+        for i, (W, b) in enumerate(layers):
+            rows = slice(i * hidden, (i + 1) * hidden)
+            np.matmul(W, y[:, rows], out=y2[:, rows])
+            y2[:, rows] += b
+
+    def _norm_tanh(self, y, work):
+        """tanh(LayerNorm(y)) of both Q in place; y's mean is zero already."""
+        shape = (len(y), 2, self.sizes.mlp_dim, y.shape[-1])
+        y, work = y.reshape(shape), work.reshape(shape)
+        np.multiply(y, y, out=work)
+        scale = work.sum(2, keepdims=True)
+        scale /= self.sizes.mlp_dim
+        scale += F32(NORM_EPS)
+        np.sqrt(scale, out=scale)
+        y /= scale
+        y *= self.gain
+        y += self.shift
+        np.tanh(y, out=y)
+
+
+def _elu(y, work):
+    """`elu` in place, with a buffer."""
+    np.minimum(y, _zeros_row(y), out=work)
+    np.expm1(work, out=work)
+    np.maximum(y, work, out=y)
+
+
+def mppi(returns, mean, config, rngs, proposals=None):
+    """MPPI: refine a Gaussian over action sequences by its elites, for each agent alone.
+
+    returns: (N, L, d, S) actions -> (N, S); mean (N, L, d): the proposal to start from; rngs:
+    one Generator for each agent; proposals (N, L, d, P): sequences that compete in every
+    iteration. Elites are chosen agent by agent, which Proposition 1 allows: with N = 1 this is
+    centralized MPPI. Returns the new mean (N, L, d), the last elites (N, L, d, E) and their
+    weights (N, E), which sum to 1.
+    """
+    mean, std = mean[..., None], F32(config.max_std)
+    for _ in range(config.iterations):
+        actions = np.stack([rng.standard_normal((*mean.shape[1:3], config.samples), F32)
+                            for rng in rngs])
+        actions *= std
+        actions += mean
+        np.clip(actions, -1, 1, out=actions)
+        if proposals is not None:
+            actions = np.concatenate([actions, proposals], -1)
+        G = returns(actions)
+        best = np.argpartition(-G, config.elites - 1, axis=1)[:, :config.elites]
+        elites = np.take_along_axis(actions, best[:, None, None], 3)
+        weights = np.take_along_axis(G, best, 1)
+        weights = np.exp(config.temperature * (weights - weights.max(1, keepdims=True)))
+        weights /= weights.sum(1, keepdims=True)
+        w = weights[:, None, None]
+        new = (w * elites).sum(3, keepdims=True)
+        std = np.sqrt((w * (elites - new) ** 2).sum(3, keepdims=True))
+        std = np.clip(std, config.min_std, config.max_std)
+        mean = config.momentum * mean + (1 - config.momentum) * new
+    return mean[..., 0], elites, weights
+
+
+class AgentPlanner:
+    """Plans for the agents of one model: the same for all of them, for a share, for N = 1."""
+
+    def __init__(self, model, config):
+        self.model, self.config, self.returns = model, config, Returns(model, config)
+        self.reset([])
+
+    def reset(self, seeds):
+        """Forget the warm start; seeds: one SeedSequence for each agent, [] to keep streams."""
+        sizes = self.model.config
+        self.mean = np.zeros((sizes.num_agents, self.config.rewards + 1, sizes.agent_actions), F32)
+        if len(seeds):
+            self.rngs = [np.random.Generator(np.random.SFC64(s)) for s in seeds]
+
+    def plan(self, z):
+        """z (N, m, 1) -> the agents' first actions (N, d); keeps the warm start."""
+        self.returns.start(z)
+        mean, elites, weights = mppi(self.returns, self.mean, self.config, self.rngs,
+                                     self._proposals(z))
+        self.mean[:, :-1] = mean[:, 1:]
+        self.mean[:, -1] = 0
+        if self.config.output == "mean":
+            return mean[:, 0]
+        pick = [min(np.searchsorted(np.cumsum(w), rng.random()), len(w) - 1)
+                for w, rng in zip(weights, self.rngs)]
+        return np.stack([e[0, :, i] for e, i in zip(elites, pick)])
+
+    def _proposals(self, z):
+        """Noisy policy rollouts (1, L, A, P), where there is a policy (TD-MPC's code)."""
+        if not (self.model.has_policy and self.config.pi_trajs):
+            return None
+        z, actions = np.repeat(z, self.config.pi_trajs, 2), []
+        for h in range(self.config.rewards + 1):
+            mu = self.model.policy(z)
+            noise = self.rngs[0].standard_normal(mu.shape, F32) * self.config.min_std
+            actions.append(np.clip(mu + np.clip(noise, -0.3, 0.3), -1, 1))
+            if h < self.config.rewards:
+                z = self.model.next(z, actions[-1])
+        return np.stack(actions, 1)
+
+
+class Planner:
+    """Observation in, action out, with the warm start kept between decisions.
+
+        with Planner(model, PlannerConfig(), seed=0, workers=1) as planner:
+            action = planner.act(obs)      # (O,) -> (A,) in [-1, 1]
+
+    workers: processes beside this one; each plans for its share of the agents (0: all here).
+    Every agent owns its random stream and one BLAS thread computes each product, so the plan
+    is the same, bit for bit, for every number of workers. Raises WorkerError when a worker
+    has died.
+    """
+
+    def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
+        sizes = model.config
+        self.model, n = model, sizes.num_agents
+        if not 0 <= workers < max(2, n + 1):
+            raise UserError(f"{workers} planning workers are no use to {n} agents; "
+                            f"pass 0 to {n - 1}")
+        cuts = np.linspace(0, n, min(workers, n - 1) + 2).round().astype(int)
+        self._shares = [slice(i, j) for i, j in zip(cuts, cuts[1:])]
+        self._own = AgentPlanner(model.agents(0, cuts[1]), config)
+        self._workers = self._z = self._actions = None
+        if len(self._shares) > 1:
+            context = multiprocessing.get_context("spawn")
+            # anonymous to the file system: nothing can be left behind, even after SIGKILL
+            raw = [context.RawArray("f", size) for size in (n * sizes.latent_dim, sizes.dim_action)]
+            self._z, self._actions = self._views(*raw, sizes)
+            self._workers = Workers(_planning_worker, len(self._shares) - 1, "planning worker",
+                                    (*raw, sizes))
+            for i, s in enumerate(self._shares[1:]):
+                self._workers.send(i, (model.agents(s.start, s.stop), config, s))
+        self.reset(seed)
+
+    @staticmethod
+    def _views(raw_z, raw_actions, sizes):
+        """The shared latents (N, m, 1) and actions (N, d) as arrays."""
+        n = sizes.num_agents
+        return (np.frombuffer(raw_z, F32).reshape(n, sizes.latent_dim, 1),
+                np.frombuffer(raw_actions, F32).reshape(n, sizes.agent_actions))
+
+    def reset(self, seed=None):
+        """Start an episode: forget the warm start; a seed also starts the random streams anew."""
+        n = self.model.config.num_agents
+        seeds = [] if seed is None else np.random.SeedSequence(seed).spawn(n)
+        for i, share in enumerate(self._shares[1:]):
+            self._workers.send(i, seeds[share])
+        self._own.reset(seeds[self._shares[0]])
+
+    def act(self, obs):
+        """obs (O,), anything that converts to float32 -> action (A,) float32 in [-1, 1]."""
+        obs = np.asarray(obs, F32)
+        if obs.shape != (self.model.config.dim_obs,):
+            raise UserError(f"observation: expected shape ({self.model.config.dim_obs},), "
+                            f"found {obs.shape}")
+        with one_thread():
+            z = self.model.encode(obs[:, None])
+            if not self._workers:
+                return self._own.plan(z).reshape(-1)
+            self._z[:] = z
+            for i in range(len(self._shares) - 1):
+                self._workers.send(i, "plan")
+            self._actions[self._shares[0]] = self._own.plan(np.ascontiguousarray(
+                z[self._shares[0]]))
+            for i in range(len(self._shares) - 1):
+                self._workers.receive(i)
+            return self._actions.reshape(-1).copy()
+
+    def close(self):
+        """End the worker processes."""
+        if self._workers:
+            self._workers.close()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+
+def _planning_worker(connection, raw_z, raw_actions, sizes):
+    """Plans for its share of the agents whenever told to; other messages are new streams."""
+    z, actions = Planner._views(raw_z, raw_actions, sizes)
+    model, config, share = connection.recv()
+    planner = AgentPlanner(model, config)
+    while True:
+        message = connection.recv()
+        if isinstance(message, str):
+            actions[share] = planner.plan(z[share].copy())
+            connection.send(True)
+        else:
+            planner.reset(message)
+
+
+class WorkerError(UserError):
+    """A worker process died."""
+
+
+class Workers:
+    """`count` processes that each run target(connection, *shared).
+
+    Spawned, since fork is unsafe once BLAS has threads; with one BLAS thread each; deaf to
+    Ctrl-C, which ends the parent, whose closed pipes end them. Anything large is sent through
+    the connection: a process that dies at its start would block a parent that passes it.
+    """
+
+    def __init__(self, target, count, name="worker", shared=()):
+        context, self._name, self._members = multiprocessing.get_context("spawn"), name, []
+        with _child_environment():
+            for _ in range(count):
+                here, there = context.Pipe()
+                process = context.Process(target=_run_worker, args=(target, there, *shared),
+                                          daemon=True)
+                process.start()
+                there.close()
+                self._members.append((process, here))
+
+    def send(self, i, message):
+        """Send to worker i."""
+        try:
+            self._members[i][1].send(message)
+        except (BrokenPipeError, ConnectionResetError):
+            self._died(i)
+
+    def receive(self, i):
+        """The next message of worker i; WorkerError as soon as it has died."""
+        try:
+            message = self._members[i][1].recv()
+        except (EOFError, ConnectionResetError):
+            self._died(i)
+        if isinstance(message, Exception):
+            self.close()
+            raise message
+        return message
+
+    def ready(self):
+        """Indices of workers with a message (or an end), at least one: waits for it."""
+        connections = [connection for _, connection in self._members]
+        return [connections.index(c) for c in multiprocessing.connection.wait(connections)]
+
+    def _died(self, i):
+        process = self._members[i][0]
+        process.join(1)
+        self.close()
+        raise WorkerError(f"{self._name} {i} ended with exit code {process.exitcode}; the others "
+                          f"were stopped")
+
+    def close(self):
+        """End all processes: closed pipes first, then force."""
+        for _, connection in self._members:
+            connection.close()
+        for process, _ in self._members:
+            process.join(0.2)
+            if process.is_alive():
+                process.kill()
+                process.join()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+
+@contextlib.contextmanager
+def _child_environment():
+    """Processes started in here get one BLAS thread and no SIGINT."""
+    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by the child
+    os.environ.update(dict.fromkeys(names, "1"))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _run_worker(target, connection, *arguments):
+    try:
+        with one_thread():
+            target(connection, *arguments)
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        pass  # the parent is gone or has closed the pipe
+    except UserError as error:
+        connection.send(error)
+
+
+@functools.cache
+def _thread_pools():
+    from threadpoolctl import ThreadpoolController
+    return ThreadpoolController()
+
+
+def one_thread():
+    """Context in which BLAS uses one thread."""
+    return _thread_pools().limit(limits=1, user_api="blas")
+
+
+# ======================================================================================
+# 7. Environments (appendix B.1)
+# ======================================================================================
+
+# paper's name: (dm_control domain, task, dim O, dim A); the dimensions are Figure 3's
+TASKS = {
+    "reacher-easy": ("reacher", "easy", 8, 3),
+    "reacher-hard": ("reacher", "hard", 8, 3),
+    "hopper-hop": ("hopper", "hop", 15, 4),
+    "fish-swim": ("fish", "swim", 24, 5),
+    "cheetah-run": ("cheetah", "run", 17, 6),
+    "walker-walk": ("walker", "walk", 24, 6),
+    "walker-run": ("walker", "run", 24, 6),
+    "quadruped-walk": ("quadruped", "walk", 78, 12),
+    "quadruped-run": ("quadruped", "run", 78, 12),
+    "humanoid-stand": ("humanoid", "stand", 67, 21),
+    "humanoid-walk": ("humanoid", "walk", 67, 21),
+}
+EPISODE_STEPS = 500  # decisions in an episode: 1000 control steps of dm_control
+ACTION_REPEAT = 2  # control steps a decision; their rewards are added
+REACHER_TARGET = {"easy": 0.05, "hard": 0.015}  # radius of the target, metres
+FINGER_RADIUS = 0.01
+
+# dm_control's reacher has two links; the paper's has three. Three links of 9 cm, the two
+# inner joints stop at 80 degrees, nothing collides, the task is the two-link one's.
+REACHER_XML = f"""
+<mujoco model="three-link planar reacher">
+  <compiler angle="degree"/>
+  <option timestep="0.02"><flag contact="disable"/></option>
+  <default>
+    <joint type="hinge" axis="0 0 1" damping="0.01"/>
+    <motor gear="0.05" ctrlrange="-1 1" ctrllimited="true"/>
+    <default class="link"><geom type="capsule" size="0.01" rgba="0.7 0.5 0.3 1"/></default>
+  </default>
+  <worldbody>
+    <light pos="0 0 1"/>
+    <camera name="fixed" pos="0 0 0.75"/>
+    <geom name="ground" type="plane" size="0.3 0.3 10" rgba="0.2 0.3 0.4 1"/>
+    <geom name="target" type="sphere" pos="0 0 0.01" size="0.05" rgba="0.8 0.2 0.2 1"/>
+    <body name="arm0" pos="0 0 0.01">
+      <joint name="joint0"/>
+      <geom name="arm0" class="link" fromto="0 0 0 0.09 0 0"/>
+      <body name="arm1" pos="0.09 0 0">
+        <joint name="joint1" limited="true" range="-80 80"/>
+        <geom name="arm1" class="link" fromto="0 0 0 0.09 0 0"/>
+        <body name="hand" pos="0.09 0 0">
+          <joint name="joint2" limited="true" range="-80 80"/>
+          <geom name="hand" class="link" fromto="0 0 0 0.1 0 0"/>
+          <body name="finger" pos="0.09 0 0">
+            <geom name="finger" type="sphere" size="{FINGER_RADIUS}" rgba="0.9 0.6 0.2 1"/>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="joint0" joint="joint0"/>
+    <motor name="joint1" joint="joint1"/>
+    <motor name="joint2" joint="joint2"/>
+  </actuator>
+</mujoco>
+"""
+
+
+class Environment:
+    """One of the paper's 11 tasks. MuJoCo is imported here and nowhere else.
+
+    Observations are dm_control's dict, concatenated in its own order, float32 (dim O,).
+    Actions (dim A,) in [-1, 1] are scaled to the action spec and applied ACTION_REPEAT times.
+    Raises UserError for an unknown task or an installation that dm_control can't work with.
+    """
+
+    def __init__(self, task):
+        domain, name, self.dim_obs, self.dim_action = lookup_task(task)
+        os.environ.setdefault("MUJOCO_GL", "disable")  # states only: needs no display
+        try:
+            from dm_control import suite
+            from dm_control.rl import control
+            from dm_control.suite import reacher
+        except (ImportError, RuntimeError, AttributeError) as error:
+            raise UserError(
+                f"dm_control does not import ({error}); it needs mujoco==3.17.0 beside "
+                f"dm-control==1.0.50, and MUJOCO_GL unset or one of egl, osmesa, disable "
+                f"(it is {os.environ['MUJOCO_GL']!r})") from error
+        if domain == "reacher":
+            self._env = control.Environment(
+                reacher.Physics.from_xml_string(REACHER_XML),
+                reacher.Reacher(REACHER_TARGET[name], random=0), time_limit=20)
+        else:
+            self._env = suite.load(domain, name, task_kwargs={"random": 0})
+        spec = self._env.action_spec()
+        self._low, self._scale = spec.minimum, (spec.maximum - spec.minimum) / 2
+
+    @staticmethod
+    def _observation(timestep):
+        return np.concatenate([np.ravel(v) for v in timestep.observation.values()]).astype(F32)
+
+    def reset(self, seed):
+        """Start the episode that the integer `seed` stands for; returns (dim O,)."""
+        self._env.task.random.seed(seed)
+        return self._observation(self._env.reset())
+
+    def step(self, action):
+        """Apply action (dim A,); returns next observation (dim O,) and reward in [0, 2]."""
+        control = self._low + self._scale * (np.asarray(action, np.float64) + 1)
+        reward = 0.0
+        for _ in range(ACTION_REPEAT):
+            timestep = self._env.step(control)
+            reward += timestep.reward
+        return self._observation(timestep), reward
+
+
+def lookup_task(task):
+    """(domain, name, dim O, dim A) of a task; UserError with the nearest name otherwise."""
+    if task not in TASKS:
+        near = difflib.get_close_matches(str(task), TASKS, n=1, cutoff=0)
+        raise UserError(f"unknown task {task!r}; did you mean {near[0]!r}? "
+                        f"Known tasks: {', '.join(TASKS)}")
+    return TASKS[task]
+
+
+def episode_seeds(seed, episodes):
+    """Seeds of an evaluation's episodes: independent streams, the first n the same for all n."""
+    return [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(seed).spawn(episodes)]
+
+
+def hindsight(obs, reward, later, chosen, task):
+    """Move the target of reacher segments to where the finger is later in the episode.
+
+    The observation is (3 joints, 2 finger-to-target, 3 velocities) and the dynamics don't know
+    the target, so subtracting a later step's finger-to-target gives a true segment of an episode
+    with another target. Changes obs (H+1, B, 8) and reward (H, B) in place where chosen (B,);
+    later (B, 8) holds the later observations. The new reward is that of the decision's end for
+    all its repeated actions.
+    """
+    radius = REACHER_TARGET[lookup_task(task)[1]] + FINGER_RADIUS
+    obs[:, chosen, 3:5] -= later[chosen, 3:5]
+    distance = np.linalg.norm(obs[1:, chosen, 3:5], axis=-1)
+    reward[:, chosen] = ACTION_REPEAT * (distance <= radius)
+
+
+def _environment_worker(connection):
+    environments = [Environment(task) for task in connection.recv()]
+    while True:
+        command, values = connection.recv()
+        connection.send([getattr(e, command)(v) for e, v in zip(environments, values)])
+
+
+class EnvironmentPool:
+    """`count` environments of a task in `workers` processes (at least one), stepped together.
+
+    Every episode lasts EPISODE_STEPS, so they all start and end at the same time.
+    """
+
+    def __init__(self, task, count, workers):
+        lookup_task(task)
+        self._shares = [s for s in np.array_split(np.arange(count), max(1, workers)) if len(s)]
+        self._workers = Workers(_environment_worker, len(self._shares), "environment worker")
+        for i, share in enumerate(self._shares):
+            self._workers.send(i, [task] * len(share))
+
+    def _call(self, command, values):
+        for i, share in enumerate(self._shares):
+            self._workers.send(i, (command, [values[j] for j in share]))
+        return [answer for i in range(len(self._shares)) for answer in self._workers.receive(i)]
+
+    def reset(self, seeds):
+        """One integer seed for each environment; returns observations (count, dim O)."""
+        return np.stack(self._call("reset", seeds))
+
+    def step(self, actions):
+        """actions (count, dim A); returns observations (count, dim O) and rewards (count,)."""
+        obs, reward = zip(*self._call("step", actions))
+        return np.stack(obs), np.array(reward, F32)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._workers.close()
+
+
+# ======================================================================================
+# 8. Data: weights, replay, files
+# ======================================================================================
+
+DATA = Path(__file__).resolve().parent / "data"
+FORMAT = "fac-tdmpc-ref 1"
+
+
+@contextlib.contextmanager
+def atomic_file(path, mode="wb", **options):
+    """A file that appears under its name only when it is complete; UserError if it can't."""
+    path, temporary = Path(path), None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(prefix=path.name, suffix=".tmp", dir=path.parent)
+        with os.fdopen(handle, mode, **options) as file:
+            yield file
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise UserError(f"{path}: can't be written: {error.strerror or error}") from error
+    finally:
+        if temporary:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(temporary)
+
+
+def write_npz(path, header, arrays, compress=False):
+    """Arrays and a JSON header in one .npz."""
+    text = np.frombuffer(json.dumps({"format": FORMAT, **header}).encode(), np.uint8)
+    with atomic_file(path) as file:
+        (np.savez_compressed if compress else np.savez)(file, header=text, **arrays)
+
+
+def read_npz(path, kind):
+    """(header, arrays) of a file that `write_npz` made; UserError names what is wrong."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {key: file[key] for key in file.files}
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+    except (OSError, ValueError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
+        raise UserError(f"{path}: not a readable .npz file ({error})") from None
+    try:
+        header = json.loads(arrays.pop("header").tobytes())
+    except (KeyError, ValueError):
+        raise UserError(f"{path}: header: expected a JSON entry of this name, found none; "
+                        f"files of this project are made by data/train_expert.py and distill"
+                        ) from None
+    if header.get("format") != FORMAT:
+        raise UserError(f"{path}: header: format: expected {FORMAT!r}, found "
+                        f"{header.get('format')!r}; make the file anew with this version")
+    if header.get("kind") not in kind:
+        raise UserError(f"{path}: header: kind: expected {' or '.join(kind)}, found "
+                        f"{header.get('kind')!r}")
+    return header, arrays
+
+
+def digest(array):
+    """What golden files keep of a large array: norm, product with a fixed vector, 64 entries."""
+    flat = np.asarray(array, np.float64).ravel()
+    fixed = np.cos(np.arange(flat.size, dtype=np.float64) ** 2 % 1009)
+    entries = flat[np.linspace(0, flat.size - 1, 64).astype(int)]
+    return np.r_[np.linalg.norm(flat), flat @ fixed, entries]
+
+
+def save_model(path, model, header):
+    """Weights under TD-MPC's names; torch shapes where N = 1, else with a leading agent axis."""
+    arrays = {}
+    for key, value in model.params.items():
+        value = value[..., 0] if key.endswith("bias") or key.split(".")[1] == "1" else value
+        arrays[key] = value[0] if len(value) == 1 else value
+    write_npz(path, {**header, "model": dataclasses.asdict(model.config)}, arrays)
+
+
+def load_model(path):
+    """(model, header) of an expert or student. UserError names file, key, expected and found."""
+    header, arrays = read_npz(path, ("expert", "student"))
+    config = from_dict(ModelConfig, header.get("model", {}), f"{path}: header: model")
+    params = {}
+    for name, i, kind, shape, _ in layers(config, policy="_pi.0.weight" in arrays):
+        for part, expected in (("weight", shape), ("bias", (*shape[:2], 1))):
+            key = f"{name}.{i}.{part}"
+            on_disk = expected if kind == "linear" and part == "weight" else expected[:2]
+            on_disk = on_disk[1:] if expected[0] == 1 else on_disk
+            value = arrays.pop(key, None)
+            if value is None:
+                raise UserError(f"{path}: {key}: missing; expected float32 {on_disk}")
+            if value.shape != on_disk or value.dtype != F32:
+                raise UserError(f"{path}: {key}: expected float32 {on_disk}, found {value.dtype} "
+                                f"{value.shape}; the header's sizes and the weights disagree")
+            if not np.isfinite(value).all():
+                raise UserError(f"{path}: {key}: holds values that are not finite")
+            params[key] = np.ascontiguousarray(value.reshape(expected))
+    if arrays:
+        raise UserError(f"{path}: {next(iter(arrays))}: unknown entry; expected "
+                        f"TD-MPC's state-dict names only")
+    return WorldModel(config, params), header
+
+
+class Replay:
+    """The dataset of Algorithm 1: transitions in order, episode after episode.
+
+    observation (M, O) and action (M, A) float16, continues (M,): False in an episode's last
+    row, whose action stands for nothing. Raises UserError for anything else.
+    """
+
+    def __init__(self, path):
+        self.path = path
+        self.header, arrays = read_npz(path, ("replay",))
+        for key, rank in (("observation", 2), ("action", 2), ("continues", 1)):
+            value = arrays.get(key)
+            if value is None or value.ndim != rank or len(value) != len(arrays["observation"]):
+                found = "nothing" if value is None else f"shape {value.shape}"
+                raise UserError(f"{path}: {key}: expected an array of rank {rank} with a row for "
+                                f"each transition, found {found}")
+        self.observation, self.action = arrays["observation"], arrays["action"]
+        self.ends = np.flatnonzero(~arrays["continues"].astype(bool))
+        self.dim_obs, self.dim_action = self.observation.shape[1], self.action.shape[1]
+        if not len(self.ends) or self.ends[-1] != len(self.observation) - 1:
+            raise UserError(f"{path}: continues: expected False in the last row")
+
+    @property
+    def transitions(self):
+        return len(self.observation) - len(self.ends)
+
+    def starts(self, steps, held_out):
+        """Rows from which `steps` actions stay in their episode: (training, held-out) rows.
+
+        Every (1 / held_out)-th episode is held out, so that all of the expert's training counts.
+        """
+        every = max(2, round(1 / held_out))
+        kept, held = [], []
+        for i, (begin, end) in enumerate(zip(np.r_[0, self.ends + 1], self.ends)):
+            (held if i % every == every - 1 else kept).append(np.arange(begin, end - steps + 1))
+        if not held or not sum(map(len, kept)) or not sum(map(len, held)):
+            raise UserError(f"{self.path}: {len(self.ends)} episodes are too few to hold out a "
+                            f"share of {held_out} and sample {steps} steps; collect more")
+        return np.concatenate(kept), np.concatenate(held)
+
+    def sequences(self, starts, steps):
+        """First observations (O, B) and actions (L, A, B), float32, of the rows in `starts`."""
+        obs = self.observation[starts].T.astype(F32)
+        actions = self.action[starts + np.arange(steps)[:, None]]
+        return obs, actions.swapaxes(1, 2).astype(F32)
+
+
+def data_file(task, name):
+    """data/<task>/<name>; UserError that says what to do if it isn't there."""
+    lookup_task(task)
+    path = DATA / task / name
+    if not path.exists():
+        shipped = ", ".join(sorted(p.parent.name for p in DATA.glob("*/expert.npz"))) or "none"
+        raise UserError(f"{path}: no such file; experts are at hand for: {shipped}. Train one with "
+                        f"'python data/train_expert.py --task {task}' in a checkout of the "
+                        f"repository, or name files with --expert and --replay")
+    return path
+
+
+# ======================================================================================
+# 9. Experiments and command line
+# ======================================================================================
+
+
+def run_episode(environment, planner, seed):
+    """Plan through the episode of `seed`; yields (reward, planning seconds) of each decision."""
+    planner.reset(seed)
+    obs = environment.reset(seed)
+    for _ in range(EPISODE_STEPS):
+        begin = time.perf_counter()
+        action = planner.act(obs)
+        seconds = time.perf_counter() - begin
+        obs, reward = environment.step(action)
+        yield reward, seconds
+
+
+def _evaluation_worker(connection):
+    """Runs the episodes whose seeds arrive; reports every 25 decisions."""
+    model, task, config = connection.recv()
+    environment, planner = Environment(task), Planner(model, config)
+    while True:
+        part = []
+        for decision in run_episode(environment, planner, connection.recv()):
+            part.append(decision)
+            if len(part) == 25:
+                connection.send(part)
+                part = []
+
+
+def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="evaluating"):
+    """Returns of `episodes` episodes, run side by side in `workers` processes (0: in this one).
+
+    Gives {"returns", "seeds", "plan_ms_median"}. An episode depends on its seed alone, so the
+    returns are the same for every number of workers.
+    """
+    sizes, (_, _, *dims) = model.config, lookup_task(task)
+    if dims != [sizes.dim_obs, sizes.dim_action]:
+        raise UserError(f"the model has (dim O, dim A) = ({sizes.dim_obs}, {sizes.dim_action}), "
+                        f"{task} has ({dims[0]}, {dims[1]}); name the task it was made for")
+    if episodes < 1:
+        raise UserError(f"episodes must be at least 1, not {episodes}")
+    seeds = episode_seeds(seed, episodes)
+    workers = min(os.cpu_count() or 1 if workers is None else workers, episodes)
+    returns, seconds = np.zeros(episodes), []
+    with progress(label, episodes * EPISODE_STEPS, "decision") as bar:
+        for i, part in _decisions(model, task, config, seeds, workers):
+            returns[i] += sum(reward for reward, _ in part)
+            seconds += [s for _, s in part]
+            bar.update(len(part))
+            if len(seconds) >= EPISODE_STEPS:
+                bar.set_postfix_str(f"mean return so far about "
+                                    f"{returns.sum() * EPISODE_STEPS / len(seconds):.0f}", False)
+    return {"returns": [float(r) for r in returns], "seeds": seeds,
+            "plan_ms_median": 1e3 * float(np.median(seconds))}
+
+
+def _decisions(model, task, config, seeds, workers):
+    """Yields (episode, its next (reward, seconds) pairs) until all episodes are over."""
+    if workers < 1:
+        environment, planner = Environment(task), Planner(model, config)
+        for i, seed in enumerate(seeds):
+            for decision in run_episode(environment, planner, seed):
+                yield i, [decision]
+        return
+    waiting, running, left = list(enumerate(seeds)), {}, {}
+    with Workers(_evaluation_worker, workers, "evaluation worker") as pool:
+        ready = range(workers)
+        for w in ready:
+            pool.send(w, (model, task, config))
+        while True:
+            for w in ready:
+                if w in running:
+                    part = pool.receive(w)
+                    left[w] -= len(part)
+                    yield running[w], part
+                if not left.get(w) and waiting:
+                    running[w], episode_seed = waiting.pop(0)
+                    left[w] = EPISODE_STEPS
+                    pool.send(w, episode_seed)
+            if not any(left.values()):
+                return
+            ready = pool.ready()
+
+
+def measure_planning(planners, observations):
+    """Median milliseconds a decision of several planners, taken in turn so that noise is shared."""
+    seconds = [[] for _ in planners]
+    for i, obs in enumerate(observations):
+        for planner, times in zip(planners, seconds):
+            begin = time.perf_counter()
+            planner.act(obs)
+            if i >= 2:  # the first ones make buffers
+                times.append(time.perf_counter() - begin)
+    return [1e3 * float(np.median(times)) for times in seconds]
+
+
+def progress(label, total, unit, initial=0):
+    """A progress bar on stderr with rate and remaining time."""
+    from tqdm import tqdm
+    return tqdm(desc=label, total=total, initial=initial, unit=unit, file=sys.stderr,
+                dynamic_ncols=True, smoothing=0.1,
+                mininterval=0.5 if sys.stderr.isatty() else 20)
+
+
+CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correlation_h0",
+         "rank_correlation_h1", "rank_correlation_last")
+
+
+def train_student(distiller, out, settings):
+    """Algorithm 1 to its end, with a learning curve and checkpoints in `out`.
+
+    A run that was cut off goes on from its checkpoint and ends as if it had not been. Returns
+    (curve rows, seconds).
+    """
+    checkpoint, config = out / "checkpoint.npz", distiller.config
+    curve, before = [], 0.0
+    if checkpoint.exists():
+        header, arrays = read_npz(checkpoint, ("checkpoint",))
+        for key, value in json.loads(json.dumps(settings)).items():
+            if header["settings"].get(key) != value:
+                raise UserError(f"{checkpoint}: an unfinished run with other settings ({key}: "
+                                f"expected {value}, found {header['settings'].get(key)}); finish it "
+                                f"with its own, delete it, or choose another --out")
+        curve, before = header["curve"], header["seconds"]
+        distiller.load(arrays)
+    began = saved = time.time()
+    every = max(1, min(250, config.steps // 8))
+    losses = []
+    with progress("distilling", config.steps, "step", distiller.t) as bar:
+        while distiller.t < config.steps:
+            rate = distiller.learning_rate(distiller.t)
+            losses.append(distiller.step())
+            bar.update()
+            if distiller.t % every == 0 or distiller.t == config.steps:
+                loss, kl_reward, kl_value = np.mean(losses, 0)
+                losses, seconds = [], before + time.time() - began
+                rank = rank_correlation(distiller.student, distiller.expert, distiller.replay,
+                                        distiller.held_out_starts, distiller.steps,
+                                        config.noise_std, distiller.seed, states=64)
+                curve.append([distiller.t, round(seconds, 2), float(loss), float(kl_reward),
+                              float(kl_value), rate, float(rank[0]), float(rank[min(1, len(rank) - 1)]),
+                              float(rank[-1])])
+                bar.set_postfix_str(f"loss {loss:.4f} KL reward {kl_reward:.4f} value "
+                                    f"{kl_value:.4f} rank {rank[0]:.3f}", False)
+                write_curve(out / "curve.csv", curve)
+                if time.time() - saved > 30 or distiller.t == config.steps:
+                    write_npz(checkpoint, {"kind": "checkpoint", "settings": settings,
+                                           "curve": curve, "seconds": seconds}, distiller.state())
+                    saved = time.time()
+    return curve, before + time.time() - began
+
+
+def write_curve(path, curve):
+    """The learning curve as CSV."""
+    with atomic_file(path, "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(CURVE)
+        writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in row] for row in curve)
+
+
+def draw_curve(path, curve, title):
+    """Losses and rank correlations over the steps; False where matplotlib is missing."""
+    try:
+        import matplotlib
+    except ImportError:
+        return False
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    columns = dict(zip(CURVE, np.array(curve).T))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+    for key, label in (("kl_reward", "rewards"), ("kl_value", "values")):
+        left.semilogy(columns["step"], columns[key], label=label)
+    left.set(xlabel="gradient step", ylabel="KL divergence", title=title)
+    for key, label in (("rank_correlation_h0", "h = 0"), ("rank_correlation_h1", "h = 1"),
+                       ("rank_correlation_last", "last step")):
+        right.plot(columns["step"], columns[key], label=label)
+    right.set(xlabel="gradient step", ylabel="rank correlation of Q",
+              title="held-out states", ylim=(None, 1))
+    for axes in (left, right):
+        axes.legend()
+        axes.grid(alpha=0.3)
+    with atomic_file(path) as file:
+        figure.savefig(file, dpi=110, format="png")
+    plt.close(figure)
+    return True
+
+
+def recorded_returns(header, config, seeds):
+    """The expert's recorded returns for these episodes and this planner, or None."""
+    record = header.get("evaluation") or {}
+    if record.get("planner") != dataclasses.asdict(config) or \
+            record.get("seeds", [])[:len(seeds)] != seeds:
+        return None
+    return record["returns"][:len(seeds)]
+
+
+def command_distill(args):
+    """distill: expert and replay in, student, learning curve, table and JSON out."""
+    began = time.time()
+    config, planning = args.configs
+    lookup_task(args.task)
+    expert, header = load_model(args.expert or data_file(args.task, "expert.npz"))
+    if header.get("task") != args.task:
+        raise UserError(f"{args.expert}: header: task: expected {args.task!r}, found "
+                        f"{header.get('task')!r}")
+    replay = Replay(args.replay or data_file(args.task, "replay.npz"))
+    out = Path(args.out or f"runs/{args.task}-{args.seed}")
+    distiller = Distiller(expert, replay, config, args.num_agents, args.seed)
+    num_agents = distiller.model_config.num_agents
+    settings = {"task": args.task, "seed": args.seed, "num_agents": num_agents,
+                "distill": dataclasses.asdict(config)}
+    print(f"{args.task}: {num_agents} agents of {distiller.model_config.latent_dim} latent features"
+          f", {len(distiller.vector):,} weights; replay of {replay.transitions:,} transitions; "
+          f"{config.steps:,} steps of {config.batch_size} x {config.noise_samples}; "
+          f"results in {out}", file=sys.stderr)
+    with one_thread(), contextlib.closing(distiller):
+        curve, seconds = train_student(distiller, out, settings)
+        rank = rank_correlation(distiller.student, expert, replay, distiller.held_out_starts,
+                                distiller.steps, config.noise_std, args.seed, states=256)
+    student = distiller.student
+    save_model(out / "student.npz", student, {"kind": "student", **settings})
+    with atomic_file(out / "config.json", "w") as file:
+        json.dump({**settings, "planner": dataclasses.asdict(planning)}, file, indent=1)
+    drawn = draw_curve(out / "curve.png", curve, f"{args.task}, seed {args.seed}")
+
+    seeds = episode_seeds(args.eval_seed, args.episodes)
+    found = evaluate(student, args.task, planning, args.episodes, args.eval_seed, args.workers,
+                     "evaluating the student")
+    returns = recorded_returns(header, planning, seeds)
+    recorded = returns is not None and not args.evaluate_expert
+    if not recorded:
+        returns = evaluate(expert, args.task, planning, args.episodes, args.eval_seed, args.workers,
+                           "evaluating the expert")["returns"]
+    rows = replay.observation[np.random.default_rng(0).choice(distiller.held_out_starts, 22)]
+    beside = min(num_agents, os.cpu_count() or 1) - 1
+    with Planner(expert, planning) as central, Planner(student, planning) as alone, \
+            Planner(student, planning, workers=beside) as parallel:
+        ms = measure_planning([central, alone, parallel], rows.astype(F32))
+
+    result = {
+        "task": args.task, "seed": args.seed, "steps": config.steps, "seconds": round(seconds, 1),
+        "expert_return_mean": float(np.mean(returns)), "expert_return_std": float(np.std(returns)),
+        "student_return_mean": float(np.mean(found["returns"])),
+        "student_return_std": float(np.std(found["returns"])),
+        "episodes": args.episodes, "kl_reward": curve[-1][3], "kl_value": curve[-1][4],
+        "rank_correlation": float(rank[0]), "plan_ms_expert": ms[0],
+        "plan_ms_student": ms[2], "speedup": ms[0] / ms[2], "expert_recorded": recorded,
+        "out": str(out), "rank_correlation_by_step": [float(r) for r in rank],
+        "plan_ms_student_in_process": ms[1], "plan_workers": beside,
+        "student_returns": found["returns"], "expert_returns": returns,
+        "seconds_total": round(time.time() - began, 1)}
+    with atomic_file(out / "result.json", "w") as file:
+        json.dump(result, file, indent=1)
+    (out / "checkpoint.npz").unlink(missing_ok=True)
+
+    print(f"\n{args.task}, {args.episodes} episodes, evaluation seed {args.eval_seed}, MPPI with "
+          f"{planning.samples} samples, {planning.iterations} iterations, horizon "
+          f"{planning.horizon}\n")
+    print_table([
+        ("", "return", "ms a decision", "speed-up"),
+        (f"expert ({'recorded' if recorded else 'measured now'})",
+         f"{np.mean(returns):.0f} ± {np.std(returns):.0f}", f"{ms[0]:.1f}", "1.0"),
+        (f"student, N = {num_agents}, one process",
+         f"{result['student_return_mean']:.0f} ± {result['student_return_std']:.0f}",
+         f"{ms[1]:.1f}", f"{ms[0] / ms[1]:.1f}"),
+        (f"student, {beside} worker{'s' * (beside != 1)} beside", "the same plans",
+         f"{ms[2]:.1f}", f"{ms[0] / ms[2]:.1f}")])
+    print(f"\nreturn kept {np.mean(found['returns']) / max(np.mean(returns), 1e-9):.2f}, rank "
+          f"correlation of Q {rank[0]:.3f} (h = 0) to {rank[-1]:.3f} (h = {len(rank) - 1}), "
+          f"distilled in {seconds:.0f} s, {result['seconds_total']:.0f} s in all, {out}/"
+          + ("" if drawn else "\n(no picture: pip install 'fac-tdmpc-ref[plots]' draws curve.png)"))
+    return result
+
+
+def print_table(rows):
+    """Columns as wide as they need to be; the first to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows)]
+    for row in rows:
+        print("  ".join(cell.ljust(w) if i == 0 else cell.rjust(w)
+                        for i, (cell, w) in enumerate(zip(row, widths))))
+
+
+def command_evaluate(args):
+    """evaluate: a model's returns on a task."""
+    (planning,) = args.configs
+    model, header = load_model(args.model)
+    task = args.task or header.get("task")
+    found = evaluate(model, task, planning, args.episodes, args.seed, args.workers)
+    returns = found["returns"]
+    result = {"return_mean": float(np.mean(returns)), "return_std": float(np.std(returns)),
+              "returns": returns, "plan_ms_median": found["plan_ms_median"],
+              "episodes": args.episodes, "task": task, "seed": args.seed}
+    if args.record:
+        header["evaluation"] = {"returns": returns, "seeds": found["seeds"], "seed": args.seed,
+                                "planner": dataclasses.asdict(planning)}
+        save_model(args.model, model, header)
+    print_table([("task", "episodes", "return", "min", "max", "ms a decision"),
+                 (task, str(args.episodes), f"{np.mean(returns):.0f} ± {np.std(returns):.0f}",
+                  f"{min(returns):.0f}", f"{max(returns):.0f}", f"{found['plan_ms_median']:.1f}")])
+    return result
+
+
+def add_config(parser, config_class, title=None, prefix="", **defaults):
+    """A flag for every field of a config; `--help` shows default and paper value."""
+    group = parser.add_argument_group(title or config_class.__doc__.split(".")[0])
+    for f in dataclasses.fields(config_class):
+        default, paper = defaults.get(f.name, f.default), f.metadata["paper"]
+        shown = f"{default}" if paper is None else f"{default}; paper: {paper}"
+        kind = {"action": argparse.BooleanOptionalAction}
+        if not isinstance(default, bool):
+            kind = {"type": type(default), "choices": f.metadata["choices"],
+                    "metavar": None if f.metadata["choices"] else type(default).__name__.upper()}
+        group.add_argument(f"--{prefix}{f.name}".replace("_", "-"), default=None,
+                           dest=f"{config_class.__name__}.{f.name}",
+                           help=f"{f.metadata['help']} [{shown}]", **kind)
+
+
+def from_args(config_class, args, **defaults):
+    """The config that the flags of `add_config` give, on top of `defaults`."""
+    for f in dataclasses.fields(config_class):
+        value = getattr(args, f"{config_class.__name__}.{f.name}")
+        if value is not None:
+            defaults[f.name] = value
+    return config_class(**defaults)
+
+
+def paper_preset(config_class):
+    """The paper's value of every field that departs from it."""
+    return {f.name: f.metadata["paper"] for f in dataclasses.fields(config_class)
+            if f.metadata["paper"] is not None}
+
+
+class Parser(argparse.ArgumentParser):
+    def error(self, message):
+        self.exit(2, f"{self.prog}: error: {message} (try --help)\n")
+
+
+def make_parser():
+    """The command line, generated from the configs of section 1."""
+    parser = Parser(prog="fac_tdmpc_ref.py", description="Fac-TDMPC in NumPy: distil a TD-MPC "
+                    "expert into one small world model for each joint, and plan with them in "
+                    "parallel.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def command(name, run, help, **extra):
+        sub = commands.add_parser(name, help=help, description=help, **extra)
+        sub.set_defaults(run=run)
+        sub.add_argument("--json", action="store_true",
+                         help="print one JSON object as the last line of stdout")
+        return sub
+
+    sub = command("distill", command_distill, "Distil a task's expert into a factored student "
+                  "(Algorithm 1), then evaluate and time both with MPPI.",
+                  epilog="A run that was cut off goes on when the same command is given again.")
+    sub.add_argument("--task", default="reacher-hard", help="one of: " + ", ".join(TASKS))
+    sub.add_argument("--seed", type=int, default=0, help="of distillation [0]")
+    sub.add_argument("--num-agents", type=int, help="N, a divisor of dim(A) [dim(A)]")
+    sub.add_argument("--preset", choices=("default", "paper"), default="default",
+                     help="paper: Algorithm 1 with Table 2 to the letter (days on a laptop)")
+    sub.add_argument("--expert", help="expert file [data/TASK/expert.npz]")
+    sub.add_argument("--replay", help="replay file [data/TASK/replay.npz]")
+    sub.add_argument("--out", help="folder for the results [runs/TASK-SEED]")
+    sub.add_argument("--episodes", type=int, default=20, help="evaluation episodes [20]")
+    sub.add_argument("--eval-seed", type=int, default=0, help="of the evaluation episodes [0]")
+    sub.add_argument("--workers", type=int, help="processes that run episodes side by side; 0: "
+                     "all in this one [cores]")
+    sub.add_argument("--evaluate-expert", action="store_true",
+                     help="measure the expert's return anew instead of reading its record")
+    add_config(sub, DistillConfig)
+    add_config(sub, PlannerConfig, prefix="plan-")
+
+    sub = command("evaluate", command_evaluate, "Plan with a model (expert or student) through "
+                  "whole episodes.")
+    sub.add_argument("--model", required=True, help="an expert.npz or student.npz")
+    sub.add_argument("--task", help="one of: " + ", ".join(TASKS) + " [the model's own]")
+    sub.add_argument("--episodes", type=int, default=20, help="[20]")
+    sub.add_argument("--seed", type=int, default=0, help="of the episodes [0]")
+    sub.add_argument("--workers", type=int, help="processes that run episodes side by side; 0: "
+                     "all in this one [cores]")
+    sub.add_argument("--record", action="store_true",
+                     help="write the returns into the model's header, where distill finds them")
+    add_config(sub, PlannerConfig)
+    return parser
+
+
+def main(argv=None):
+    """Run the command line; returns the exit status."""
+    args = make_parser().parse_args(argv)
+    try:
+        if args.command == "distill":
+            preset = paper_preset(DistillConfig) if args.preset == "paper" else {}
+            args.configs = from_args(DistillConfig, args, **preset), from_args(PlannerConfig, args)
+        else:
+            args.configs = (from_args(PlannerConfig, args),)
+        result = args.run(args)
+    except UserError as error:
+        print(f"fac_tdmpc_ref.py: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("fac_tdmpc_ref.py: interrupted; the same command goes on where it was cut off",
+              file=sys.stderr)
+        return 130
+    if args.json:
+        print(json.dumps(result))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
