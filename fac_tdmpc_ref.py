@@ -46,6 +46,7 @@ import sys
 import tempfile
 import time
 import zipfile
+import zlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,7 +90,8 @@ class ModelConfig:
                             f"not {self.num_agents}")
         if self.dim_action % self.num_agents:
             raise UserError(f"{self.dim_action} action dimensions can't be shared by "
-                            f"{self.num_agents} agents; N may be one of {divisors(self.dim_action)}")
+                            f"{self.num_agents} agents; N may be one of "
+                            f"{divisors(self.dim_action)}")
 
     @property
     def agent_actions(self):
@@ -102,7 +104,7 @@ class PlannerConfig:
     """MPPI. Raises UserError for values that can't plan."""
     samples: int = field(512, "S: action sequences drawn in an iteration (Table 2)")
     iterations: int = field(6, "refinements of the proposal in a decision (Table 2)")
-    elites: int = field(0, "sequences that refine the proposal; 0: samples / 8, Table 2's 64 of 512")
+    elites: int = field(0, "sequences that refine the proposal; 0: samples / 8 (Table 2: 64)")
     pi_trajs: int = field(24, "policy proposals, where the model has a policy (Table 2)")
     horizon: int = field(3, "H: rewards that are summed before Q (Table 2)")
     value_at: str = field("after", "where Q ends the return: after (Equation 2: H rewards, then Q "
@@ -119,9 +121,11 @@ class PlannerConfig:
     def __post_init__(self):
         if self.elites == 0:
             object.__setattr__(self, "elites", max(1, self.samples // 8))
-        for name in ("samples", "iterations", "elites", "horizon"):
-            if getattr(self, name) < 1:
-                raise UserError(f"planner: {name} must be at least 1, not {getattr(self, name)}")
+        for name, least in (("samples", 1), ("iterations", 1), ("elites", 1), ("horizon", 1),
+                            ("pi_trajs", 0), ("temperature", 0), ("discount", 0), ("momentum", 0)):
+            if not getattr(self, name) >= least:  # not >=, so that nan is refused
+                raise UserError(f"planner: {name} must be at least {least}, not "
+                                f"{getattr(self, name)}")
         if self.elites > self.samples:
             raise UserError(f"planner: {self.elites} elites can't be chosen from {self.samples} "
                             f"samples; lower elites or raise samples")
@@ -168,7 +172,8 @@ class DistillConfig:
     def __post_init__(self):
         for name in ("steps", "batch_size", "horizon"):
             if getattr(self, name) < 1:
-                raise UserError(f"distillation: {name} must be at least 1, not {getattr(self, name)}")
+                raise UserError(f"distillation: {name} must be at least 1, not "
+                                f"{getattr(self, name)}")
         if self.noise_samples < 2:
             raise UserError(f"distillation: noise_samples must be at least 2 to be ranked, not "
                             f"{self.noise_samples}")
@@ -218,12 +223,20 @@ def check_choices(config):
 
 
 def from_dict(config_class, values, where):
-    """A config from a dict, e.g. a file's header; unknown keys are refused."""
-    known = [f.name for f in dataclasses.fields(config_class)]
-    for key in values:
+    """A config from a dict, e.g. a file's header; unknown keys and other types are refused."""
+    known = {f.name: type(f.default) for f in dataclasses.fields(config_class)}
+    if not isinstance(values, dict):
+        raise UserError(f"{where}: expected settings, found {values!r}")
+    for key, value in values.items():
         if key not in known:
-            raise UserError(f"{where}: unknown setting {key!r}; expected some of {', '.join(known)}")
-    return config_class(**values)
+            raise UserError(f"{where}: unknown setting {key!r}; expected some of "
+                            f"{', '.join(known)}")
+        if type(value) is not known[key] and (known[key], type(value)) != (float, int):
+            raise UserError(f"{where}: {key}: expected {known[key].__name__}, found {value!r}")
+    try:
+        return config_class(**values)
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from None
 
 
 def student_config(expert, num_agents, sizes, encoder_input):
@@ -547,6 +560,9 @@ def layers(config, policy=False):
 # ======================================================================================
 
 HEADS = (("_reward", MLP), ("_Q1", QNET), ("_Q2", QNET))
+# A softmax doesn't see a constant, so these have no gradient but rounding errors, and Adam lets
+# them wander. Planning doesn't see a constant either.
+UNSEEN = ("_reward.4.bias", "_Q1.5.bias", "_Q2.5.bias")
 
 
 def predict(model, z, actions, tapes=None, empty=np.empty):
@@ -670,6 +686,7 @@ class Distiller:
         self.train_starts, self.held_out_starts = replay.starts(self.steps, config.held_out)
         self._teacher, self._next = ThreadPoolExecutor(1), None
         self._arenas = Arena(), Arena()  # the student's and the teacher's
+        self._threads = one_thread()  # in each of the two, until `close`
 
     def batch(self, t):
         """Line 4 and the expert's part of step t: features, perturbed actions, targets."""
@@ -713,8 +730,9 @@ class Distiller:
         self._next = None
 
     def close(self):
-        """Stop the teacher's thread."""
+        """Stop the teacher's thread and give BLAS its threads back."""
         self._teacher.shutdown(wait=True, cancel_futures=True)
+        self._threads.restore_original_limits()
 
 
 def perturbed_batch(expert, student, replay, starts, steps, noise_samples, noise_std, rng,
@@ -979,10 +997,10 @@ class Planner:
     def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
         sizes = model.config
         self.model, n = model, sizes.num_agents
-        if not 0 <= workers < max(2, n + 1):
-            raise UserError(f"{workers} planning workers are no use to {n} agents; "
-                            f"pass 0 to {n - 1}")
-        cuts = np.linspace(0, n, min(workers, n - 1) + 2).round().astype(int)
+        if not 0 <= workers < n:
+            raise UserError(f"{workers} planning workers are no use to {n} agents, one of which "
+                            f"plans in this process; pass 0 to {n - 1}")
+        cuts = np.linspace(0, n, workers + 2).round().astype(int)
         self._shares = [slice(i, j) for i, j in zip(cuts, cuts[1:])]
         self._own = AgentPlanner(model.agents(0, cuts[1]), config)
         self._workers = self._z = self._actions = None
@@ -1162,7 +1180,7 @@ def _thread_pools():
 
 
 def one_thread():
-    """Context in which BLAS uses one thread."""
+    """BLAS uses one thread from now on: a context, or until its restore_original_limits()."""
     return _thread_pools().limit(limits=1, user_api="blas")
 
 
@@ -1386,13 +1404,16 @@ def read_npz(path, kind):
     """(header, arrays) of a file that `write_npz` made; UserError names what is wrong."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            arrays = {key: file[key] for key in file.files}
+            arrays = {key: np.asarray(file[key]) for key in file.files}
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
-    except (OSError, ValueError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, KeyError, AttributeError, TypeError, RuntimeError,
+            zlib.error, zipfile.BadZipFile) as error:
         raise UserError(f"{path}: not a readable .npz file ({error})") from None
     try:
         header = json.loads(arrays.pop("header").tobytes())
+        if not isinstance(header, dict):
+            raise ValueError
     except (KeyError, ValueError):
         raise UserError(f"{path}: header: expected a JSON entry of this name, found none; "
                         f"files of this project are made by data/train_expert.py and distill"
@@ -1407,11 +1428,11 @@ def read_npz(path, kind):
 
 
 def digest(array):
-    """What golden files keep of a large array: norm, product with a fixed vector, 64 entries."""
+    """What golden files keep of a large array: norm, product with a unit vector, 64 entries."""
     flat = np.asarray(array, np.float64).ravel()
     fixed = np.cos(np.arange(flat.size, dtype=np.float64) ** 2 % 1009)
     entries = flat[np.linspace(0, flat.size - 1, 64).astype(int)]
-    return np.r_[np.linalg.norm(flat), flat @ fixed, entries]
+    return np.r_[np.linalg.norm(flat), flat @ fixed / np.linalg.norm(fixed), entries]
 
 
 def save_model(path, model, header):
@@ -1458,14 +1479,18 @@ class Replay:
     def __init__(self, path):
         self.path = path
         self.header, arrays = read_npz(path, ("replay",))
-        for key, rank in (("observation", 2), ("action", 2), ("continues", 1)):
+        for key, rank, dtype in (("observation", 2, np.float16), ("action", 2, np.float16),
+                                 ("continues", 1, np.bool_)):
             value = arrays.get(key)
-            if value is None or value.ndim != rank or len(value) != len(arrays["observation"]):
-                found = "nothing" if value is None else f"shape {value.shape}"
-                raise UserError(f"{path}: {key}: expected an array of rank {rank} with a row for "
-                                f"each transition, found {found}")
+            if value is None or value.ndim != rank or value.dtype != dtype or \
+                    len(value) != len(arrays["observation"]):
+                found = "nothing" if value is None else f"{value.dtype} {value.shape}"
+                raise UserError(f"{path}: {key}: expected {dtype.__name__} of rank {rank} with a "
+                                f"row for each transition, found {found}")
+            if not np.isfinite(value).all():
+                raise UserError(f"{path}: {key}: holds values that are not finite")
         self.observation, self.action = arrays["observation"], arrays["action"]
-        self.ends = np.flatnonzero(~arrays["continues"].astype(bool))
+        self.ends = np.flatnonzero(~arrays["continues"])
         self.dim_obs, self.dim_action = self.observation.shape[1], self.action.shape[1]
         if not len(self.ends) or self.ends[-1] != len(self.observation) - 1:
             raise UserError(f"{path}: continues: expected False in the last row")
@@ -1493,6 +1518,11 @@ class Replay:
         obs = self.observation[starts].T.astype(F32)
         actions = self.action[starts + np.arange(steps)[:, None]]
         return obs, actions.swapaxes(1, 2).astype(F32)
+
+
+def checksum(arrays):
+    """CRC of the arrays' bytes: tells experts and replays of the same sizes apart."""
+    return functools.reduce(lambda crc, a: zlib.crc32(np.ascontiguousarray(a), crc), arrays, 0)
 
 
 def data_file(task, name):
@@ -1629,8 +1659,8 @@ def train_student(distiller, out, settings):
         for key, value in json.loads(json.dumps(settings)).items():
             if header["settings"].get(key) != value:
                 raise UserError(f"{checkpoint}: an unfinished run with other settings ({key}: "
-                                f"expected {value}, found {header['settings'].get(key)}); finish it "
-                                f"with its own, delete it, or choose another --out")
+                                f"expected {value}, found {header['settings'].get(key)}); finish "
+                                f"it with its own, delete it, or choose another --out")
         curve, before = header["curve"], header["seconds"]
         distiller.load(arrays)
     began = saved = time.time()
@@ -1648,8 +1678,8 @@ def train_student(distiller, out, settings):
                                         distiller.held_out_starts, distiller.steps,
                                         config.noise_std, distiller.seed, states=64)
                 curve.append([distiller.t, round(seconds, 2), float(loss), float(kl_reward),
-                              float(kl_value), rate, float(rank[0]), float(rank[min(1, len(rank) - 1)]),
-                              float(rank[-1])])
+                              float(kl_value), rate, float(rank[0]),
+                              float(rank[min(1, len(rank) - 1)]), float(rank[-1])])
                 bar.set_postfix_str(f"loss {loss:.4f} KL reward {kl_reward:.4f} value "
                                     f"{kl_value:.4f} rank {rank[0]:.3f}", False)
                 write_curve(out / "curve.csv", curve)
@@ -1709,21 +1739,31 @@ def command_distill(args):
     began = time.time()
     config, planning = args.configs
     lookup_task(args.task)
-    expert, header = load_model(args.expert or data_file(args.task, "expert.npz"))
-    if header.get("task") != args.task:
-        raise UserError(f"{args.expert}: header: task: expected {args.task!r}, found "
-                        f"{header.get('task')!r}")
+    if args.episodes < 1:
+        raise UserError(f"episodes must be at least 1, not {args.episodes}")
+    expert_path = args.expert or data_file(args.task, "expert.npz")
+    expert, header = load_model(expert_path)
+    for key, expected in (("kind", "expert"), ("task", args.task)):
+        if header.get(key) != expected:
+            raise UserError(f"{expert_path}: header: {key}: expected {expected!r}, found "
+                            f"{header.get(key)!r}")
     replay = Replay(args.replay or data_file(args.task, "replay.npz"))
     out = Path(args.out or f"runs/{args.task}-{args.seed}")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{out}: can't be written: {error.strerror}") from None
     distiller = Distiller(expert, replay, config, args.num_agents, args.seed)
     num_agents = distiller.model_config.num_agents
     settings = {"task": args.task, "seed": args.seed, "num_agents": num_agents,
-                "distill": dataclasses.asdict(config)}
+                "distill": dataclasses.asdict(config),
+                "data": [checksum(expert.params.values()),
+                         checksum([replay.observation, replay.action])]}
     print(f"{args.task}: {num_agents} agents of {distiller.model_config.latent_dim} latent features"
           f", {len(distiller.vector):,} weights; replay of {replay.transitions:,} transitions; "
           f"{config.steps:,} steps of {config.batch_size} x {config.noise_samples}; "
           f"results in {out}", file=sys.stderr)
-    with one_thread(), contextlib.closing(distiller):
+    with contextlib.closing(distiller):
         curve, seconds = train_student(distiller, out, settings)
         rank = rank_correlation(distiller.student, expert, replay, distiller.held_out_starts,
                                 distiller.steps, config.noise_std, args.seed, states=256)
@@ -1840,6 +1880,13 @@ def paper_preset(config_class):
             if f.metadata["paper"] is not None}
 
 
+def natural(text):
+    """argparse type: a whole number, 0 or more."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"expected a whole number, 0 or more, found {text!r}")
+    return int(text)
+
+
 class Parser(argparse.ArgumentParser):
     def error(self, message):
         self.exit(2, f"{self.prog}: error: {message} (try --help)\n")
@@ -1863,7 +1910,7 @@ def make_parser():
                   "(Algorithm 1), then evaluate and time both with MPPI.",
                   epilog="A run that was cut off goes on when the same command is given again.")
     sub.add_argument("--task", default="reacher-hard", help="one of: " + ", ".join(TASKS))
-    sub.add_argument("--seed", type=int, default=0, help="of distillation [0]")
+    sub.add_argument("--seed", type=natural, default=0, help="of distillation [0]")
     sub.add_argument("--num-agents", type=int, help="N, a divisor of dim(A) [dim(A)]")
     sub.add_argument("--preset", choices=("default", "paper"), default="default",
                      help="paper: Algorithm 1 with Table 2 to the letter (days on a laptop)")
@@ -1871,8 +1918,8 @@ def make_parser():
     sub.add_argument("--replay", help="replay file [data/TASK/replay.npz]")
     sub.add_argument("--out", help="folder for the results [runs/TASK-SEED]")
     sub.add_argument("--episodes", type=int, default=20, help="evaluation episodes [20]")
-    sub.add_argument("--eval-seed", type=int, default=0, help="of the evaluation episodes [0]")
-    sub.add_argument("--workers", type=int, help="processes that run episodes side by side; 0: "
+    sub.add_argument("--eval-seed", type=natural, default=0, help="of the evaluation episodes [0]")
+    sub.add_argument("--workers", type=natural, help="processes that run episodes side by side; 0: "
                      "all in this one [cores]")
     sub.add_argument("--evaluate-expert", action="store_true",
                      help="measure the expert's return anew instead of reading its record")
@@ -1884,8 +1931,8 @@ def make_parser():
     sub.add_argument("--model", required=True, help="an expert.npz or student.npz")
     sub.add_argument("--task", help="one of: " + ", ".join(TASKS) + " [the model's own]")
     sub.add_argument("--episodes", type=int, default=20, help="[20]")
-    sub.add_argument("--seed", type=int, default=0, help="of the episodes [0]")
-    sub.add_argument("--workers", type=int, help="processes that run episodes side by side; 0: "
+    sub.add_argument("--seed", type=natural, default=0, help="of the episodes [0]")
+    sub.add_argument("--workers", type=natural, help="processes that run episodes side by side; 0: "
                      "all in this one [cores]")
     sub.add_argument("--record", action="store_true",
                      help="write the returns into the model's header, where distill finds them")

@@ -327,10 +327,12 @@ def train(args, config, planner):
                     batch = replay.sample(rng, config.batch_size, config.horizon, args.task)
                     losses.append([x.detach() for x in
                                    learner.update(*map(to_device, batch), std)])
-            terms = np.mean([[float(x) for x in row] for row in losses[-100:]] or [[0, 0, 0]], 0)
+            recent = [[float(x) for x in row] for row in losses[-100:]]
+            terms = np.mean(recent or [[0] * 3], 0)
             elapsed = seconds + time.time() - began
-            bar.set_postfix_str(f"return {returns.mean():.0f} (best {returns.max():.0f}) consistency "
-                                f"{terms[0]:.4f} reward {terms[1]:.4f} value {terms[2]:.3f}")
+            bar.set_postfix_str(f"return {returns.mean():.0f} (best {returns.max():.0f}) "
+                                f"consistency {terms[0]:.4f} reward {terms[1]:.4f} "
+                                f"value {terms[2]:.3f}")
             new = not (out / "curve.csv").exists()
             with open(out / "curve.csv", "a", newline="") as f:
                 writer = csv.writer(f)
@@ -360,7 +362,8 @@ def export(args, config, planner, learner, replay, decisions, minutes):
     weights = {k: v.cpu().numpy() for k, v in learner.model.state_dict().items()}
     about = {"task": args.task, "seed": args.seed, "decisions": decisions, "minutes": minutes,
              "updates": learner.updates, "torch": torch.__version__, "device": str(args.device),
-             "training": dataclasses.asdict(config), "training_planner": dataclasses.asdict(planner)}
+             "training": dataclasses.asdict(config),
+             "training_planner": dataclasses.asdict(planner)}
     fac.write_npz(folder / "expert.npz",
                   {"kind": "expert", "model": dataclasses.asdict(sizes), **about}, weights)
     # oldest first; the last row of an episode holds its last observation and no action

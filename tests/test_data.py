@@ -1,0 +1,550 @@
+"""Tests of section 8 (weights, replay, files) and of `from_dict`, which reads their headers."""
+
+import errno
+import json
+import os
+import zipfile
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import fac_tdmpc_ref as fac  # noqa: E402
+
+F32 = np.float32
+
+
+def make_model(num_agents=1, policy=False, expert_latent_dim=0):
+    """A small model of 6 actions with no weight left at its initial zero or one."""
+    config = fac.ModelConfig(dim_obs=7, dim_action=6, num_agents=num_agents, latent_dim=5,
+                             enc_dim=9, mlp_dim=11, expert_latent_dim=expert_latent_dim,
+                             expert_enc_dim=8)
+    rng = np.random.default_rng(0)
+    model = fac.WorldModel.create(config, rng, policy)
+    for value in model.params.values():
+        value[:] = rng.standard_normal(value.shape, F32)
+    return model
+
+
+def contents(path):
+    """(header, arrays) of a file, read without the code under test."""
+    with np.load(path) as file:
+        arrays = {k: file[k] for k in file.files}
+    return json.loads(arrays.pop("header").tobytes()), arrays
+
+
+def write_raw(path, header, arrays):
+    """Like write_npz, but takes any header and leaves nothing out or in."""
+    if header is not None:
+        text = header if isinstance(header, bytes) else json.dumps(header).encode()
+        arrays = {**arrays, "header": np.frombuffer(text, np.uint8)}
+    np.savez(path, **arrays)
+    return path
+
+
+def refusal(call, *parts):
+    """The message of the UserError that `call` raises; it is one line and holds all `parts`."""
+    with pytest.raises(fac.UserError) as caught:
+        call()
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in parts:
+        assert str(part) in message
+    return message
+
+
+@pytest.fixture
+def expert_file(tmp_path):
+    fac.save_model(tmp_path / "expert.npz", make_model(policy=True), {"kind": "expert", "task": "t"})
+    return tmp_path / "expert.npz"
+
+
+def replay_arrays(episodes=6, rows=30, dim_obs=8, dim_action=3):
+    rng = np.random.default_rng(1)
+    n = episodes * rows
+    return {"observation": rng.standard_normal((n, dim_obs)).astype(np.float16),
+            "action": rng.uniform(-1, 1, (n, dim_action)).astype(np.float16),
+            "continues": np.arange(1, n + 1) % rows != 0}
+
+
+def write_replay(path, **changes):
+    arrays = {**replay_arrays(), **changes}
+    fac.write_npz(path, {"kind": "replay"}, {k: v for k, v in arrays.items() if v is not None},
+                  compress=True)
+    return path
+
+
+# models: round trip -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("num_agents", [1, 2, 3])
+@pytest.mark.parametrize("policy, expert_latent_dim", [(True, 0), (False, 0), (False, 13)])
+def test_a_model_comes_back_bit_for_bit(tmp_path, num_agents, policy, expert_latent_dim):
+    model = make_model(num_agents, policy, expert_latent_dim)
+    path = tmp_path / "model.npz"
+    fac.save_model(path, model, {"kind": "student", "task": "fish-swim", "extra": [1, {"a": 2.5}]})
+    found, header = fac.load_model(path)
+    assert found.config == model.config and found.has_policy == policy
+    assert list(found.params) == list(model.params)
+    for key, value in model.params.items():
+        assert found.params[key].dtype == F32 and found.params[key].flags.c_contiguous
+        assert found.params[key].shape == value.shape and np.array_equal(found.params[key], value)
+    assert (header["task"], header["extra"]) == ("fish-swim", [1, {"a": 2.5}])
+    obs = np.ones((7, 2), F32)
+    assert np.array_equal(found.encode(obs), model.encode(obs))
+
+
+def test_an_expert_is_stored_with_the_shapes_of_torch(expert_file):
+    _, arrays = contents(expert_file)
+    shapes = {key: value.shape for key, value in arrays.items()}
+    assert shapes["_encoder.0.weight"] == (9, 7) and shapes["_encoder.0.bias"] == (9,)
+    assert shapes["_Q1.1.weight"] == shapes["_Q1.1.bias"] == (11,)    # LayerNorm
+    assert shapes["_pi.4.weight"] == (6, 11) and shapes["_dynamics.0.weight"] == (11, 5 + 6)
+
+
+def test_agents_are_stored_with_a_leading_axis(tmp_path):
+    fac.save_model(tmp_path / "m.npz", make_model(3), {"kind": "student"})
+    _, arrays = contents(tmp_path / "m.npz")
+    assert arrays["_encoder.2.weight"].shape == (15, 9)     # central: no axis
+    assert arrays["_Q2.0.weight"].shape == (3, 11, 5 + 2)
+    assert arrays["_Q2.1.weight"].shape == arrays["_Q2.0.bias"].shape == (3, 11)
+
+
+# read_npz -----------------------------------------------------------------------------
+
+
+def test_missing_file(tmp_path):
+    refusal(lambda: fac.load_model(tmp_path / "none.npz"), tmp_path / "none.npz", "no such file")
+    refusal(lambda: fac.Replay(tmp_path / "none.npz"), tmp_path / "none.npz", "no such file")
+
+
+@pytest.mark.parametrize("content", [b"", b"weights", b"PK\x03\x04", b"\x80\x04N.", b"\x93NUMPY"])
+def test_a_file_that_is_no_npz(tmp_path, content):
+    path = tmp_path / "model.npz"
+    path.write_bytes(content)
+    refusal(lambda: fac.load_model(path), path, "not a readable .npz file")
+
+
+def test_a_folder_is_no_npz(tmp_path):
+    refusal(lambda: fac.load_model(tmp_path), tmp_path, "not a readable .npz file")
+
+
+def test_a_single_array_is_no_npz(tmp_path):
+    np.save(tmp_path / "model.npy", np.zeros(3))
+    refusal(lambda: fac.load_model(tmp_path / "model.npy"), tmp_path / "model.npy")
+
+
+def test_an_entry_that_is_no_array(tmp_path, expert_file):
+    """An .npz may hold any file; NumPy hands such entries out as bytes."""
+    with zipfile.ZipFile(tmp_path / "header.npz", "w") as file:
+        file.writestr("header", "{}")
+    refusal(lambda: fac.load_model(tmp_path / "header.npz"), tmp_path / "header.npz", "header")
+    with zipfile.ZipFile(expert_file, "a") as file:
+        file.writestr("notes.txt", "hello")
+    refusal(lambda: fac.load_model(expert_file), expert_file, "notes.txt", "unknown entry")
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.999])
+def test_truncated_file(expert_file, share):
+    data = expert_file.read_bytes()
+    expert_file.write_bytes(data[:int(share * len(data))])
+    refusal(lambda: fac.load_model(expert_file), expert_file, "not a readable .npz file")
+
+
+def test_damage_anywhere_is_refused_in_one_line(tmp_path, expert_file):
+    """Bytes overwritten at random: either the file still loads, or a UserError names it."""
+    rng, refused = np.random.default_rng(0), 0
+    replay = write_replay(tmp_path / "replay.npz")
+    for path, load in ((expert_file, fac.load_model), (replay, fac.Replay)):
+        data, damaged = path.read_bytes(), tmp_path / "damaged.npz"
+        for _ in range(150):
+            changed = bytearray(data)
+            changed[rng.integers(len(data))] ^= int(rng.integers(1, 256))
+            damaged.write_bytes(changed)
+            try:
+                load(damaged)
+            except fac.UserError as error:
+                assert str(damaged) in str(error) and "\n" not in str(error)
+                refused += 1
+    assert refused > 150
+
+
+def test_pickles_are_refused(tmp_path, expert_file):
+    header, arrays = contents(expert_file)
+    path = tmp_path / "evil.npz"
+
+    class Evil:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "ran"),)
+
+    arrays["_Q1.0.bias"] = np.array([Evil()], object)
+    write_raw(path, header, arrays)
+    refusal(lambda: fac.load_model(path), path, "allow_pickle")
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize("header", [None, b"{", b"\xff\xfe", [1, 2], None.__class__, "text"])
+def test_header_missing_or_no_json_object(tmp_path, expert_file, header):
+    _, arrays = contents(expert_file)
+    header = b"null" if header is type(None) else header
+    path = write_raw(tmp_path / "m.npz", header, arrays)
+    refusal(lambda: fac.load_model(path), path, "header")
+
+
+@pytest.mark.parametrize("changes, parts", [
+    ({"format": "fac-tdmpc-ref 0"}, ("header: format", repr(fac.FORMAT), "'fac-tdmpc-ref 0'")),
+    ({"format": None}, ("header: format", repr(fac.FORMAT), "None")),
+    ({"kind": "replay"}, ("header: kind", "expert or student", "'replay'")),
+    ({"kind": None}, ("header: kind", "expert or student", "None")),
+    ({"model": None}, ("header: model",)),
+    ({"model": [3]}, ("header: model",)),
+])
+def test_wrong_header(tmp_path, expert_file, changes, parts):
+    header, arrays = contents(expert_file)
+    path = write_raw(tmp_path / "m.npz", {**header, **changes}, arrays)
+    refusal(lambda: fac.load_model(path), path, *parts)
+
+
+@pytest.mark.parametrize("changes, parts", [
+    ({"width": 3}, ("unknown setting 'width'", "mlp_dim")),
+    ({"num_agents": "3"}, ("num_agents", "int", "'3'")),
+    ({"latent_dim": 5.5}, ("latent_dim", "int", "5.5")),
+    ({"num_agents": 4}, ("4 agents", "[1, 2, 3, 6]")),
+])
+def test_wrong_model_settings_name_the_file(tmp_path, expert_file, changes, parts):
+    header, arrays = contents(expert_file)
+    header["model"].update(changes)
+    path = write_raw(tmp_path / "m.npz", header, arrays)
+    refusal(lambda: fac.load_model(path), path, "header: model", *parts)
+
+
+# load_model ---------------------------------------------------------------------------
+
+
+def changed_model(expert_file, key, change):
+    """The expert file with one entry replaced by change(entry), or dropped where that is None."""
+    header, arrays = contents(expert_file)
+    value = change(arrays.pop(key))
+    return write_raw(expert_file.parent / "changed.npz", header,
+                     {**arrays, **({} if value is None else {key: value})})
+
+
+KEYS = ("_encoder.2.weight", "_dynamics.4.bias", "_Q1.1.weight", "_pi.2.bias")
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_missing_weights(expert_file, key):
+    path = changed_model(expert_file, key, lambda v: None)
+    refusal(lambda: fac.load_model(path), path, key, "missing", "float32")
+
+
+def test_a_policy_without_its_first_layer_is_unknown(expert_file):
+    """That layer tells whether there is a policy: without it the rest is left over."""
+    path = changed_model(expert_file, "_pi.0.weight", lambda v: None)
+    refusal(lambda: fac.load_model(path), path, "_pi.0.bias", "unknown entry")
+
+
+@pytest.mark.parametrize("key", KEYS)
+@pytest.mark.parametrize("change", [lambda v: v[1:], lambda v: v[None], lambda v: v[..., None]])
+def test_weights_of_a_wrong_shape(expert_file, key, change):
+    shape = contents(expert_file)[1][key].shape
+    path = changed_model(expert_file, key, change)
+    found = contents(path)[1][key].shape
+    refusal(lambda: fac.load_model(path), path, key, f"expected float32 {shape}", f"{found}")
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float16", "int32"])
+def test_weights_of_a_wrong_dtype(expert_file, dtype):
+    path = changed_model(expert_file, "_Q2.3.weight", lambda v: v.astype(dtype))
+    refusal(lambda: fac.load_model(path), path, "_Q2.3.weight", "expected float32",
+            f"found {dtype}")
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_weights_that_are_not_finite(expert_file, bad):
+    def spoil(value):
+        value[-1] = bad
+        return value
+
+    path = changed_model(expert_file, "_reward.2.bias", spoil)
+    refusal(lambda: fac.load_model(path), path, "_reward.2.bias", "not finite")
+
+
+def test_unknown_entry(expert_file):
+    header, arrays = contents(expert_file)
+    path = write_raw(expert_file.parent / "m.npz", header, {**arrays, "_Q3.0.weight": np.ones(2)})
+    refusal(lambda: fac.load_model(path), path, "_Q3.0.weight", "unknown entry")
+
+
+def test_sizes_in_the_header_must_be_those_of_the_weights(expert_file):
+    header, arrays = contents(expert_file)
+    header["model"]["mlp_dim"] = 12
+    path = write_raw(expert_file.parent / "m.npz", header, arrays)
+    refusal(lambda: fac.load_model(path), path, "_dynamics.0.weight", "(12, 11)", "(11, 11)")
+
+
+# from_dict ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("config", [
+    fac.PlannerConfig(samples=40, min_std=0.1, output="mean"),
+    fac.DistillConfig(steps=3, final_term=False, kl="reverse"),
+    fac.ModelConfig(8, 3, 3, expert_latent_dim=6), fac.ExpertConfig(lr=1e-3)])
+def test_a_config_survives_json(config):
+    values = json.loads(json.dumps(vars(config)))
+    assert fac.from_dict(type(config), values, "x") == config
+
+
+def test_whole_numbers_will_do_for_decimal_ones():
+    assert fac.from_dict(fac.PlannerConfig, {"max_std": 1}, "x").max_std == 1
+
+
+@pytest.mark.parametrize("values, parts", [
+    ({"sample": 3}, ("unknown setting 'sample'", "samples", "horizon")),
+    ({"samples": "3"}, ("samples", "'3'")),
+    ({"samples": None}, ("samples", "None")),
+    ({"samples": 4, "elites": 5}, ("5 elites", "4 samples")),
+    ({"output": "best"}, ("output", "sampled, mean", "'best'")),
+])
+def test_settings_that_are_refused(values, parts):
+    refusal(lambda: fac.from_dict(fac.PlannerConfig, values, "some file"), "some file", *parts)
+
+
+# replay -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("key", ["observation", "action", "continues"])
+def test_replay_without_an_array(tmp_path, key):
+    path = write_replay(tmp_path / "r.npz", **{key: None})
+    refusal(lambda: fac.Replay(path), path, key, "expected", "found nothing")
+
+
+@pytest.mark.parametrize("key, value", [
+    ("observation", np.zeros(180, np.float16)), ("observation", np.float16(1)),
+    ("action", np.zeros((179, 3), np.float16)), ("action", np.zeros((180, 3, 1), np.float16)),
+    ("continues", np.ones((180, 1), bool)), ("continues", np.zeros(181, bool))])
+def test_replay_with_a_wrong_shape(tmp_path, key, value):
+    path = write_replay(tmp_path / "r.npz", **{key: value})
+    refusal(lambda: fac.Replay(path), path, "expected", "found", *(
+        [] if key == "observation" else [f"{key}:", value.shape]))
+
+
+@pytest.mark.parametrize("key, dtype", [
+    ("observation", "float64"), ("observation", "<U1"), ("action", "int8"),
+    ("continues", "float16"), ("continues", "<U1")])
+def test_replay_with_a_wrong_dtype(tmp_path, key, dtype):
+    value = replay_arrays()[key].astype(dtype)
+    path = write_replay(tmp_path / "r.npz", **{key: value})
+    refusal(lambda: fac.Replay(path), path, f"{key}:", dtype,
+            "bool" if key == "continues" else "float16")
+
+
+@pytest.mark.parametrize("key", ["observation", "action"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_replay_that_is_not_finite(tmp_path, key, bad):
+    value = replay_arrays()[key]
+    value[100, 1] = bad
+    path = write_replay(tmp_path / "r.npz", **{key: value})
+    refusal(lambda: fac.Replay(path), path, f"{key}:", "not finite")
+
+
+@pytest.mark.parametrize("continues", [np.ones(180, bool), np.arange(180) % 30 != 0])
+def test_replay_must_end_with_an_episode(tmp_path, continues):
+    path = write_replay(tmp_path / "r.npz", continues=continues)
+    refusal(lambda: fac.Replay(path), path, "continues:", "expected False in the last row")
+
+
+def test_empty_replay(tmp_path):
+    path = write_replay(tmp_path / "r.npz", **{k: v[:0] for k, v in replay_arrays().items()})
+    refusal(lambda: fac.Replay(path), path, "continues:")
+
+
+def test_a_model_is_no_replay(expert_file):
+    refusal(lambda: fac.Replay(expert_file), expert_file, "header: kind", "'expert'", "replay")
+
+
+def test_what_a_replay_holds(tmp_path):
+    replay = fac.Replay(write_replay(tmp_path / "r.npz"))
+    assert (replay.dim_obs, replay.dim_action, replay.transitions) == (8, 3, 6 * 29)
+    assert replay.ends.tolist() == [29, 59, 89, 119, 149, 179]
+
+
+@settings(max_examples=60, deadline=None)
+@given(lengths=st.lists(st.integers(1, 9), min_size=1, max_size=12), steps=st.integers(1, 5),
+       held_out=st.sampled_from([0.01, 0.05, 0.2, 0.3, 0.5, 0.9]))
+def test_starts_stay_in_their_episode_and_no_episode_serves_both(lengths, steps, held_out):
+    """Compared with a plain loop. An episode of length l has l rows, l - 1 of them with actions."""
+    replay = fac.Replay.__new__(fac.Replay)  # no file: only the rows' lengths matter
+    replay.path, replay.ends = "replay", np.cumsum(lengths) - 1
+    episode = np.repeat(np.arange(len(lengths)), lengths)
+    every = max(2, round(1 / held_out))
+    possible = [row for row in range(len(episode))
+                if row + steps < len(episode) and episode[row] == episode[row + steps]]
+    expected = [[row for row in possible if (episode[row] % every == every - 1) == held]
+                for held in (False, True)]
+    if not all(expected):
+        refusal(lambda: replay.starts(steps, held_out), "replay", "too few", held_out)
+        return
+    found = replay.starts(steps, held_out)
+    assert [rows.tolist() for rows in found] == expected
+    assert not set(episode[found[0]]) & set(episode[found[1]])
+
+
+def test_the_share_that_is_held_out(tmp_path):
+    """6 episodes of 29 actions: every third held out, 26 starts of 4 steps in each."""
+    kept, held = fac.Replay(write_replay(tmp_path / "r.npz")).starts(4, 1 / 3)
+    assert set(held // 30) == {2, 5} and set(kept // 30) == {0, 1, 3, 4}
+    assert (len(kept), len(held)) == (4 * 26, 2 * 26)
+    assert max(kept % 30) == max(held % 30) == 25
+
+
+def test_sequences(tmp_path):
+    replay, arrays = fac.Replay(write_replay(tmp_path / "r.npz")), replay_arrays()
+    starts = np.array([3, 60, 3, 170, 0])
+    obs, actions = replay.sequences(starts, 4)
+    assert obs.shape == (8, 5) and actions.shape == (4, 3, 5)
+    assert obs.dtype == actions.dtype == F32
+    for b, start in enumerate(starts):
+        np.testing.assert_array_equal(obs[:, b], arrays["observation"][start])
+        for h in range(4):
+            np.testing.assert_array_equal(actions[h, :, b], arrays["action"][start + h])
+
+
+# data_file ----------------------------------------------------------------------------
+
+
+def test_data_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(fac, "DATA", tmp_path)
+    message = refusal(lambda: fac.data_file("fish-swim", "expert.npz"),
+                      tmp_path / "fish-swim" / "expert.npz", "at hand for: none",
+                      "train_expert.py --task fish-swim", "--expert", "--replay")
+    assert "walker" not in message
+    for task in ("walker-walk", "cheetah-run"):
+        (tmp_path / task).mkdir()
+        (tmp_path / task / "expert.npz").touch()
+    refusal(lambda: fac.data_file("fish-swim", "expert.npz"), "cheetah-run, walker-walk.")
+    found = fac.data_file("walker-walk", "expert.npz")
+    assert found == tmp_path / "walker-walk" / "expert.npz"
+    refusal(lambda: fac.data_file("walker-walk", "replay.npz"), "walker-walk/replay.npz")
+    refusal(lambda: fac.data_file("walker-wolk", "expert.npz"), "did you mean 'walker-walk'")
+
+
+# atomic_file --------------------------------------------------------------------------
+
+
+@pytest.fixture
+def old_file(tmp_path):
+    path = tmp_path / "out" / "file.npz"
+    path.parent.mkdir()
+    path.write_bytes(b"old")
+    return path
+
+
+def untouched(path):
+    return path.read_bytes() == b"old" and os.listdir(path.parent) == [path.name]
+
+
+def test_a_file_appears_complete_and_readable_by_all(tmp_path):
+    path = tmp_path / "new" / "folder" / "file.bin"
+    with fac.atomic_file(path) as file:
+        file.write(b"half")
+        assert not path.exists()
+        file.write(b"whole")
+    assert path.read_bytes() == b"halfwhole" and os.listdir(path.parent) == ["file.bin"]
+    assert path.stat().st_mode & 0o777 == 0o644
+
+
+def test_the_old_file_is_there_until_the_new_one_is(old_file):
+    with fac.atomic_file(old_file, "w", newline="") as file:
+        file.write("new\n")
+        file.flush()
+        assert old_file.read_bytes() == b"old"
+    assert old_file.read_bytes() == b"new\n" and os.listdir(old_file.parent) == ["file.npz"]
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
+def test_a_writer_that_fails_changes_nothing(old_file, error):
+    with pytest.raises(error), fac.atomic_file(old_file) as file:
+        file.write(b"half a fi")
+        raise error
+    assert untouched(old_file)
+
+
+def test_a_full_disk_is_reported_and_changes_nothing(old_file):
+    def write():
+        with fac.atomic_file(old_file) as file:
+            file.write(b"half")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    refusal(write, old_file, "can't be written", "No space left on device")
+    assert untouched(old_file)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="only Linux has a disk that is full")
+def test_write_npz_on_a_device_that_is_full(old_file, monkeypatch):
+    """The same with a real ENOSPC out of NumPy's own writing."""
+    fdopen = os.fdopen
+
+    def on_full_disk(handle, mode, **options):
+        os.dup2(os.open("/dev/full", os.O_WRONLY), handle)
+        return fdopen(handle, mode, **options)
+
+    monkeypatch.setattr(fac.os, "fdopen", on_full_disk)
+    refusal(lambda: fac.write_npz(old_file, {}, {"a": np.zeros(100_000)}), old_file,
+            "can't be written")
+    monkeypatch.undo()
+    assert untouched(old_file)
+
+
+@pytest.mark.parametrize("name", ["mkstemp", "replace"])
+def test_a_folder_that_can_not_be_written(old_file, monkeypatch, name):
+    """Read-only, as the system would say it: permissions don't bind the superuser."""
+    def refused(*_, **__):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    monkeypatch.setattr(fac.tempfile if name == "mkstemp" else fac.os, name, refused)
+    refusal(lambda: fac.write_npz(old_file, {}, {}), old_file, "can't be written",
+            "Permission denied")
+    assert untouched(old_file)
+
+
+@pytest.mark.parametrize("inside", ["file.npz/new.npz", "file.npz/folder/new.npz"])
+def test_a_folder_that_is_a_file(old_file, inside):
+    path = old_file.parent / inside
+    refusal(lambda: fac.write_npz(path, {}, {}), path, "can't be written")
+    assert untouched(old_file)
+
+
+def test_a_path_that_is_a_folder(tmp_path):
+    (tmp_path / "model.npz").mkdir()
+    refusal(lambda: fac.write_npz(tmp_path / "model.npz", {}, {}), "model.npz", "can't be written")
+    assert os.listdir(tmp_path) == ["model.npz"]
+
+
+# digest -------------------------------------------------------------------------------
+
+
+def test_digest_keeps_norm_product_and_entries():
+    array = np.random.default_rng(0).standard_normal((6, 50)).astype(F32)
+    found = fac.digest(array)
+    flat = array.astype(np.float64).ravel()
+    assert found.shape == (66,) and found.dtype == np.float64
+    np.testing.assert_allclose(found[0] ** 2, sum(v * v for v in flat), rtol=1e-12)
+    product = sum(v * np.cos(i * i % 1009) for i, v in enumerate(flat))
+    np.testing.assert_allclose(found[1], product, rtol=1e-9)
+    assert found[2] == flat[0] and found[-1] == flat[-1] and np.isin(found[2:], flat).all()
+
+
+@pytest.mark.parametrize("change", [
+    lambda a: a * F32(1.001), lambda a: a[::-1], lambda a: np.roll(a, 1), lambda a: -a])
+def test_digest_tells_arrays_apart(change):
+    """Scaled, reordered or negated arrays have other digests, which is what they are for."""
+    array = np.random.default_rng(0).standard_normal(5000).astype(F32)
+    assert not np.allclose(fac.digest(array), fac.digest(change(array)), rtol=1e-4)
+    assert np.array_equal(fac.digest(array), fac.digest(array.reshape(50, 100)))

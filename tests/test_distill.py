@@ -1,0 +1,117 @@
+"""Algorithm 1 end to end on a small expert."""
+import numpy as np
+import pytest
+
+import fac_tdmpc_ref as fac
+from test_planning import random_model
+
+CONFIG = fac.DistillConfig(steps=300, batch_size=16, warmup=20, lr=3e-3)
+
+
+@pytest.fixture(scope="module")
+def replay(tmp_path_factory):
+    rng = np.random.default_rng(0)
+    observation = rng.standard_normal((24 * 31, 8)).astype(np.float16)
+    action = rng.uniform(-1, 1, (24 * 31, 3)).astype(np.float16)
+    continues = np.tile(np.arange(31) < 30, 24)
+    path = tmp_path_factory.mktemp("replay") / "replay.npz"
+    fac.write_npz(path, {"kind": "replay"}, {"observation": observation, "action": action,
+                                             "continues": continues})
+    return fac.Replay(path)
+
+
+def distilled(replay, config, steps, num_agents=None, seed=0):
+    expert = random_model(n=1, policy=True)
+    distiller = fac.Distiller(expert, replay, config, num_agents, seed)
+    losses = np.array([distiller.step() for _ in range(steps)])
+    distiller.close()
+    return distiller, losses
+
+
+def rank(distiller):
+    return fac.rank_correlation(distiller.student, distiller.expert, distiller.replay,
+                                distiller.held_out_starts, distiller.steps, 0.5, 0, states=64)
+
+
+@pytest.mark.parametrize("settings", [{}, {"encoder_input": "observation", "kl": "reverse"}])
+def test_the_student_learns_the_experts_order(replay, settings):
+    config = fac.dataclasses.replace(CONFIG, **settings)
+    fresh, _ = distilled(replay, config, 0)
+    before = rank(fresh)
+    weights = {k: v.copy() for k, v in fresh.expert.params.items()}
+    distiller, losses = distilled(replay, config, config.steps)
+    assert losses[-30:, 0].mean() < 0.7 * losses[:30, 0].mean()
+    assert losses[-30:, 1].mean() < losses[:30, 1].mean()
+    assert losses[-30:, 2].mean() < losses[:30, 2].mean()
+    after = rank(distiller)
+    assert after.shape == (4,) and (after > before + 0.2).all() and after[0] > 0.6
+    for key, value in distiller.expert.params.items():
+        assert np.array_equal(value, weights[key]), "the expert is frozen"
+    for key, value in distiller.student.params.items():
+        assert value.dtype == np.float32
+        if key.startswith("_expert"):
+            assert np.array_equal(value, weights[key[len("_expert"):]])
+
+
+def test_rank_correlation_of_the_expert_with_itself_is_one(replay):
+    expert = random_model(n=1, policy=True)
+    starts, _ = replay.starts(4, 0.05)
+    student = fac.WorldModel(fac.dataclasses.replace(expert.config), expert.params)
+    correlation = fac.rank_correlation(student, expert, OwnLatents(replay), starts, 4, 0.5, 0)
+    assert np.allclose(correlation, 1, atol=1e-6)
+
+
+class OwnLatents:
+    """A replay: rank_correlation of a model that reads observations needs nothing else."""
+
+    def __init__(self, replay):
+        self.sequences = replay.sequences
+
+
+def test_same_seed_same_student(replay):
+    students = [distilled(replay, CONFIG, 5, seed=seed)[0].vector for seed in (1, 1, 2)]
+    assert np.array_equal(students[0], students[1])
+    assert not np.array_equal(students[0], students[2])
+
+
+def test_a_resumed_run_ends_as_an_uninterrupted_one(replay):
+    whole, _ = distilled(replay, CONFIG, 20)
+    first, _ = distilled(replay, CONFIG, 12)
+    second, _ = distilled(replay, CONFIG, 3)  # somewhere else, then put back
+    second._teacher = fac.ThreadPoolExecutor(1)
+    second.load({k: np.copy(v) for k, v in first.state().items()})
+    for _ in range(8):
+        second.step()
+    second.close()
+    assert np.array_equal(whole.vector, second.vector)
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_any_divisor_of_the_actions(replay, n):
+    distiller, losses = distilled(replay, CONFIG, 2, n)
+    assert distiller.model_config.num_agents == n
+    assert distiller.model_config.mlp_dim == max(512 // n, 50)
+    assert np.isfinite(losses).all()
+
+
+def test_other_numbers_of_agents_are_refused(replay):
+    for n in (2, 0, 4):
+        with pytest.raises(fac.UserError, match=r"one of \[1, 3\]"):
+            fac.Distiller(random_model(n=1), replay, CONFIG, n)
+
+
+def test_sizes_of_section_5_1():
+    expert = fac.ModelConfig(8, 12, 1, 50, 256, 512)
+    assert fac.student_config(expert, 12, "section51", "latent").latent_dim == 42
+    assert fac.student_config(expert, 12, "table2", "latent").latent_dim == 50
+    assert fac.student_config(expert, 12, "table2", "latent").expert_latent_dim == 50
+    assert fac.student_config(expert, 12, "table2", "observation").expert_latent_dim == 0
+
+
+def test_learning_rate_schedule(replay):
+    distiller, _ = distilled(replay, CONFIG, 0)
+    rates = [distiller.learning_rate(t) for t in range(CONFIG.steps)]
+    assert rates[0] < rates[10] < rates[19] <= CONFIG.lr and rates[-1] < 0.001 * CONFIG.lr
+    constant, _ = distilled(replay, fac.dataclasses.replace(
+        CONFIG, **fac.paper_preset(fac.DistillConfig)), 0)
+    assert {constant.learning_rate(t) for t in range(50)} == {1e-4}

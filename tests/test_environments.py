@@ -1,0 +1,347 @@
+"""Tests of section 7: the paper's 11 tasks as MuJoCo really runs them, and hindsight targets."""
+
+import functools
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import fac_tdmpc_ref as fac  # noqa: E402
+
+FIGURE_3 = {  # task: (dim O, dim A), copied from the paper and not from the code
+    "reacher-easy": (8, 3), "reacher-hard": (8, 3), "hopper-hop": (15, 4), "fish-swim": (24, 5),
+    "cheetah-run": (17, 6), "walker-walk": (24, 6), "walker-run": (24, 6),
+    "quadruped-walk": (78, 12), "quadruped-run": (78, 12), "humanoid-stand": (67, 21),
+    "humanoid-walk": (67, 21)}
+ROBOTS = ("reacher-hard", "hopper-hop", "fish-swim", "cheetah-run", "walker-walk",
+          "quadruped-walk", "humanoid-walk")
+LINK = 0.09  # metres
+
+
+environment = functools.cache(fac.Environment)  # making one parses XML: once for each task
+
+
+def actions_for(task, steps, seed=0):
+    return np.random.default_rng(seed).uniform(-1, 1, (steps, FIGURE_3[task][1]))
+
+
+def play(task, seed, steps=4, env=None):
+    """All observations (steps + 1, O) and rewards (steps,) of an episode's beginning."""
+    env = env or environment(task)
+    obs, rewards = [env.reset(seed)], []
+    for action in actions_for(task, steps):
+        after, reward = env.step(action)
+        obs.append(after)
+        rewards.append(reward)
+    return np.array(obs), np.array(rewards)
+
+
+def python(code, **env):
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT,
+                          env={**os.environ, **env}, timeout=60)
+
+
+# all tasks ----------------------------------------------------------------------------
+
+
+def test_tasks_are_the_eleven_of_the_paper():
+    assert {task: tuple(dims) for task, (_, _, *dims) in fac.TASKS.items()} == FIGURE_3
+
+
+@pytest.mark.parametrize("task", FIGURE_3)
+def test_sizes_in_mujoco_are_those_of_figure_3(task):
+    dim_obs, dim_action = FIGURE_3[task]
+    env = environment(task)
+    assert (env.dim_obs, env.dim_action) == (dim_obs, dim_action)
+    obs = env.reset(0)
+    assert obs.shape == (dim_obs,) and obs.dtype == np.float32
+    obs, reward = env.step(np.zeros(dim_action))
+    assert obs.shape == (dim_obs,) and obs.dtype == np.float32
+    assert 0 <= reward <= 2
+    assert env._env.action_spec().shape == (dim_action,)  # MuJoCo's own count of the actuators
+
+
+@pytest.mark.parametrize("task", FIGURE_3)
+def test_an_episode_depends_on_its_seed_alone(task):
+    first_obs, first_rewards = play(task, seed=11)
+    other_obs, _ = play(task, seed=12)
+    again_obs, again_rewards = play(task, seed=11)  # the episode between must leave no trace
+    assert np.array_equal(first_obs, again_obs)
+    assert np.array_equal(first_rewards, again_rewards)
+    assert not np.array_equal(first_obs[0], other_obs[0])
+
+
+def test_another_environment_plays_the_same_episode():
+    used = play("fish-swim", seed=3)
+    fresh = play("fish-swim", seed=3, env=fac.Environment("fish-swim"))
+    assert all(np.array_equal(a, b) for a, b in zip(used, fresh))
+
+
+@pytest.mark.parametrize("task", ["walker-walk", "fish-swim"])
+def test_a_decision_is_two_control_steps_whose_rewards_are_added(task):
+    from dm_control import suite
+    direct = suite.load(*task.split("-"), task_kwargs={"random": 5})
+
+    def flat(timestep):
+        return np.concatenate([np.ravel(v) for v in timestep.observation.values()])
+
+    obs, rewards = play(task, seed=5, steps=6)
+    expected, sums = [flat(direct.reset())], []
+    for action in actions_for(task, 6):
+        first, second = direct.step(action), direct.step(action)
+        expected.append(flat(second))
+        sums.append(first.reward + second.reward)
+    np.testing.assert_array_equal(obs, np.array(expected, np.float32))
+    np.testing.assert_array_equal(rewards, sums)
+    assert min(sums) > 0  # else the sum would not be tested
+
+
+@pytest.mark.parametrize("task", ROBOTS)
+def test_500_decisions_end_where_the_episode_of_dm_control_ends(task, monkeypatch):
+    env, last = environment(task), []
+    step = env._env.step
+
+    def recorded(control):
+        timestep = step(control)
+        last.append(timestep.last())
+        return timestep
+
+    monkeypatch.setattr(env._env, "step", recorded)
+    env.reset(0)
+    for _ in range(500):
+        env.step(np.zeros(env.dim_action))
+    assert fac.EPISODE_STEPS == 500
+    assert last == [False] * 999 + [True]
+
+
+def test_actions_are_scaled_to_the_action_spec(monkeypatch):
+    from dm_control import suite
+    low, high, received = np.array([-2.0, 0, 1, 5]), np.array([3.0, 10, 2, 7]), []
+    spec = SimpleNamespace(minimum=low, maximum=high)
+
+    def step(control):
+        received.append(control)
+        return SimpleNamespace(observation={"position": np.zeros(15)}, reward=0.0)
+
+    monkeypatch.setattr(suite, "load", lambda *_, **__: SimpleNamespace(
+        action_spec=lambda: spec, step=step))
+    env = fac.Environment("hopper-hop")
+    for action, expected in ((-1, low), (1, high), (0, (low + high) / 2)):
+        received.clear()
+        env.step(np.full(4, action, np.float32))
+        np.testing.assert_allclose(received, [expected] * fac.ACTION_REPEAT, rtol=1e-15)
+
+
+@pytest.mark.parametrize("task", ROBOTS)
+def test_extreme_actions_are_the_limits_of_the_robot(task, monkeypatch):
+    env, received = environment(task), []
+    step, spec = env._env.step, env._env.action_spec()
+    monkeypatch.setattr(env._env, "step", lambda a: received.append(np.array(a)) or step(a))
+    env.reset(0)
+    for sign, limit in ((-1, spec.minimum), (1, spec.maximum)):
+        env.step(np.full(env.dim_action, sign))
+        np.testing.assert_array_equal(received[-1], limit)
+
+
+@pytest.mark.parametrize("typed, meant", [
+    ("reacher-hart", "reacher-hard"), ("walker_walk", "walker-walk"), ("cheetah", "cheetah-run"),
+    ("Humanoid-Stand", "humanoid-stand"), ("quadruped-runs", "quadruped-run")])
+def test_unknown_task_is_told_the_nearest_and_all_known_ones(typed, meant):
+    for refuse in (fac.lookup_task, fac.Environment, lambda t: fac.EnvironmentPool(t, 1, 1)):
+        with pytest.raises(fac.UserError) as caught:
+            refuse(typed)
+        message = str(caught.value)
+        assert repr(typed) in message and f"did you mean {meant!r}" in message
+        assert all(task in message.split("Known tasks:")[1] for task in FIGURE_3)
+        assert "\n" not in message
+
+
+def test_evaluation_seeds_are_distinct_and_do_not_depend_on_how_many():
+    seeds = fac.episode_seeds(0, 50)
+    assert len(set(seeds)) == 50 and seeds[:7] == fac.episode_seeds(0, 7)
+    assert all(0 <= s < 2 ** 32 for s in seeds)  # what dm_control's RandomState takes
+    assert not set(seeds) & set(fac.episode_seeds(1, 50))
+
+
+# importing MuJoCo ---------------------------------------------------------------------
+
+
+def test_mujoco_is_imported_when_an_environment_is_made_and_not_before():
+    code = ("import sys, fac_tdmpc_ref as fac; heavy = ('mujoco', 'dm_control', 'torch', "
+            "'matplotlib'); assert not [m for m in heavy if m in sys.modules], 'too early'; "
+            "fac.lookup_task('reacher-hard'); assert 'mujoco' not in sys.modules; "
+            "fac.Environment('reacher-hard'); assert 'mujoco' in sys.modules")
+    done = python(code)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("call", ["fac.Environment('reacher-hard')",
+                                  "fac.EnvironmentPool('reacher-hard', 1, 1).reset([0])"])
+def test_a_bad_rendering_setting_is_explained(call):
+    done = python(f"import fac_tdmpc_ref as fac\ntry: {call}\n"
+                  "except fac.UserError as error: print(error)", MUJOCO_GL="nonsense")
+    assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
+    assert "MUJOCO_GL" in done.stdout and "'nonsense'" in done.stdout
+    assert done.stdout.count("\n") == 1
+
+
+# reacher ------------------------------------------------------------------------------
+
+
+def finger_position(joints):
+    """Forward kinematics of three equal links, joints (..., 3) -> (..., 2)."""
+    angles = np.cumsum(np.asarray(joints, np.float64), -1)
+    return LINK * np.stack([np.cos(angles).sum(-1), np.sin(angles).sum(-1)], -1)
+
+
+def put_target(env, position):
+    env._env.physics.named.model.geom_pos["target", ["x", "y"]] = position
+
+
+@pytest.mark.parametrize("task", ["reacher-easy", "reacher-hard"])
+def test_reacher_is_a_chain_of_three_links_of_9_cm(task):
+    env = environment(task)
+    obs = env.reset(4)
+    target = env._env.physics.named.data.geom_xpos["target", :2].copy()
+    assert 0.05 <= np.linalg.norm(target) <= 0.20
+    for action in actions_for(task, 60):
+        finger = finger_position(obs[:3])
+        np.testing.assert_allclose(env._env.physics.named.data.geom_xpos["finger", :2], finger,
+                                   atol=1e-6)
+        np.testing.assert_allclose(obs[3:5], target - finger, atol=1e-6)
+        before = obs
+        obs, _ = env.step(action)
+    assert np.abs(obs[:3] - before[:3]).max() > 1e-3  # it moved, so the chain was tested
+    data = env._env.physics.data
+    np.testing.assert_array_equal(obs[5:], data.qvel.astype(np.float32))
+
+
+def test_reacher_inner_joints_stop_at_80_degrees():
+    env = environment("reacher-hard")
+    env.reset(0)
+    model = env._env.physics.model
+    assert model.jnt_limited.tolist() == [0, 1, 1]
+    np.testing.assert_allclose(model.jnt_range[1:], np.radians([[-80, 80]] * 2))
+    with env._env.physics.reset_context():
+        env._env.physics.data.qpos[:] = np.radians([25, 80, 80])
+    folded = np.linalg.norm(env._env.physics.named.data.geom_xpos["finger", :2])
+    assert abs(folded - 0.121) < 5e-4
+    env.reset(0)
+    for _ in range(150):
+        obs, _ = env.step([1, 1, 1])
+    # MuJoCo's limits are soft: full torque pushes a little beyond them, the free joint turns on
+    assert np.all(np.abs(np.degrees(obs[1:3])) > 79) and np.all(np.degrees(obs[1:3]) < 92)
+    assert abs(obs[0]) > 2 * np.pi
+
+
+@pytest.mark.parametrize("task, target_radius", [("reacher-easy", 0.05), ("reacher-hard", 0.015)])
+def test_reacher_rewards_each_control_step_inside_target_and_finger(task, target_radius):
+    env = environment(task)
+    for seed, direction in ((0, 0.3), (1, 2.0), (2, -2.2)):
+        obs = env.reset(seed)
+        sizes = env._env.physics.named.model.geom_size
+        assert sizes["target", 0] == target_radius and sizes["finger", 0] == 0.01
+        unit = np.array([np.cos(direction), np.sin(direction)])
+        for distance, expected in ((target_radius + 0.01 - 1e-4, 2.0), (0.0, 2.0),
+                                   (target_radius + 0.01 + 1e-4, 0.0)):
+            put_target(env, finger_position(obs[:3]) + distance * unit)
+            after, reward = env.step(np.zeros(3))  # no torque, no gravity in the plane: at rest
+            assert reward == expected
+            np.testing.assert_allclose(after[:3], obs[:3], atol=1e-6)
+
+
+# hindsight ----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def segments():
+    """Five true segments of reacher episodes, H = 3, and a later step of each."""
+    rows = [play("reacher-hard", seed, steps=12) for seed in range(5)]
+    obs = np.stack([o[2:6] for o, _ in rows], 1)        # (H + 1, B, 8)
+    reward = np.stack([r[2:5] for _, r in rows], 1)     # (H, B)
+    later = np.stack([o[k] for (o, _), k in zip(rows, (3, 5, 5, 9, 12))])
+    return obs, reward, later
+
+
+CHOSEN = np.array([True, False, True, True, False])
+
+
+def test_hindsight_moves_the_target_to_the_later_finger(segments):
+    obs, reward, later = (a.copy() for a in segments)
+    fac.hindsight(obs, reward, later, CHOSEN, "reacher-hard")
+    target = finger_position(obs[:, :, :3]) + obs[:, :, 3:5]    # (H + 1, B, 2), implied
+    expected = np.broadcast_to(finger_position(later[:, :3]), target.shape)
+    np.testing.assert_allclose(target[:, CHOSEN], expected[:, CHOSEN], atol=1e-6)
+    # episodes 0 and 2: the later step lies in the segment, where the finger is now on the target
+    np.testing.assert_array_equal(obs[[1, 3], [0, 2], 3:5], 0)
+    assert np.abs(target[0, ~CHOSEN] - expected[0, ~CHOSEN]).max() > 1e-3
+
+
+def test_hindsight_changes_nothing_else(segments):
+    obs, reward, later = (a.copy() for a in segments)
+    reward[:] = 7  # no true reward: shows where it is written
+    fac.hindsight(obs, reward, later, CHOSEN, "reacher-hard")
+    np.testing.assert_array_equal(obs[:, ~CHOSEN], segments[0][:, ~CHOSEN])
+    np.testing.assert_array_equal(np.delete(obs, [3, 4], 2), np.delete(segments[0], [3, 4], 2))
+    np.testing.assert_array_equal(later, segments[2])
+    assert (reward[:, ~CHOSEN] == 7).all() and (reward[:, CHOSEN] != 7).all()
+
+
+@pytest.mark.parametrize("task, radius", [("reacher-easy", 0.06), ("reacher-hard", 0.025)])
+def test_hindsight_rewards_are_those_of_the_new_distance(task, radius):
+    obs, later = np.zeros((4, 3, 8), np.float32), np.zeros((3, 8), np.float32)
+    later[:, 3:5] = [0.1, -0.2]
+    obs[:, :, 3:5] = [0.1, -0.2]
+    obs[0, :, 3] += 5                  # the distance before the first decision earns nothing
+    obs[1, :, 3] += radius - 1e-4
+    obs[2, :, 4] += radius + 1e-4
+    reward = np.full((3, 3), 9.0)
+    fac.hindsight(obs, reward, later, np.array([True, True, False]), task)
+    np.testing.assert_array_equal(reward, [[2, 2, 9], [0, 0, 9], [2, 2, 9]])
+
+
+def test_hindsight_agrees_with_an_environment_that_has_that_target(segments):
+    """The dynamics don't know the target: playing on with it moved gives the same segment."""
+    obs, reward, later = (a.copy() for a in segments)
+    fac.hindsight(obs, reward, later, np.ones(5, bool), "reacher-hard")
+    env = environment("reacher-hard")
+    for b in range(5):
+        env.reset(b)
+        put_target(env, finger_position(later[b, :3]))
+        for t, action in enumerate(actions_for("reacher-hard", 5)):
+            found, earned = env.step(action)
+            if t >= 1:
+                np.testing.assert_allclose(found, obs[t - 1, b], atol=1e-6)
+            if t >= 2:  # ours counts the decision's end twice, so one control step may differ
+                assert abs(earned - reward[t - 2, b]) <= 1
+
+
+# environments in processes ------------------------------------------------------------
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_pool_equals_single_environments(workers):
+    task, seeds = "reacher-easy", [3, 4, 5]
+    actions = actions_for(task, 3 * 3).reshape(3, 3, -1)
+    with fac.EnvironmentPool(task, 3, workers) as pool:
+        obs = [pool.reset(seeds)]
+        rewards = []
+        for a in actions:
+            after, reward = pool.step(a)
+            obs.append(after)
+            rewards.append(reward)
+    assert rewards[0].dtype == np.float32 and obs[0].dtype == np.float32
+    for b, seed in enumerate(seeds):
+        env = environment(task)
+        np.testing.assert_array_equal(obs[0][b], env.reset(seed))
+        for t in range(3):
+            after, reward = env.step(actions[t, b])
+            np.testing.assert_array_equal(obs[t + 1][b], after)
+            assert rewards[t][b] == np.float32(reward)

@@ -1,0 +1,185 @@
+"""What PyTorch computed on the shipped weights, without PyTorch.
+
+The references are float64 results on float32 weights; ours are float32.
+"""
+import numpy as np
+import pytest
+
+import fac_tdmpc_ref as fac
+
+TASKS = sorted(p.parent.name for p in fac.DATA.glob("*/golden.npz"))
+FORWARD, GRADIENT, ADAM = 1e-5, 1e-4, 1e-5  # relative to the largest entry, or to the norm
+
+
+def relative(found, expected):
+    return float(np.abs(found - expected).max() / np.abs(expected).max())
+
+
+def assert_digest(array, expected, tolerance):
+    """Norm, product with a fixed unit vector and 64 entries, all relative to the norm."""
+    error = np.abs(fac.digest(array) - expected).max() / expected[0]
+    assert error <= tolerance, error
+
+
+@pytest.fixture(scope="module", params=TASKS)
+def golden(request):
+    folder = fac.DATA / request.param
+    model, _ = fac.load_model(folder / "expert.npz")
+    header, arrays = fac.read_npz(folder / "golden.npz", ("golden",))
+    return model, header, arrays
+
+
+def test_there_is_an_expert():
+    assert "reacher-hard" in TASKS
+
+
+def test_expert_forward(golden):
+    model, _, g = golden
+    z = model.encode(g["obs"][0])
+    a = g["action"][0][None]
+    q1, q2 = model.q(z, a)
+    for name, found in (("latent", z[0]), ("next_latent", model.next(z, a)[0]), ("q1", q1[0]),
+                        ("reward", model.reward(z, a)[0]), ("q2", q2[0]),
+                        ("policy", model.policy(z)[0])):
+        assert found.dtype == np.float32
+        assert relative(found, g[name]) < FORWARD, name
+
+
+class FixedNoise:
+    """Stands for a Generator: gives the golden file's noise."""
+
+    def __init__(self, noise):
+        self.noise = noise
+
+    def standard_normal(self, shape, dtype):
+        assert shape == self.noise.shape and dtype == np.float32
+        return self.noise.copy()
+
+
+def test_one_mppi_refinement(golden):
+    model, header, g = golden
+    config = fac.PlannerConfig(**{**header["planner"], "iterations": 1, "momentum": 0.0})
+    z = model.encode(g["obs"][0][:, :1])
+    fast = fac.Returns(model, config)
+    fast.start(z)
+    actions = np.clip(g["mppi_mean"][..., None] + config.max_std * g["mppi_noise"], -1, 1)[None]
+    for returns in (fast(actions), fac.h_step_return(model, z, actions, config)):
+        assert relative(returns[0], g["mppi_returns"]) < FORWARD
+    mean, elites, weights = fac.mppi(fast, g["mppi_mean"][None], config,
+                                     [FixedNoise(g["mppi_noise"])])
+    assert np.isclose(weights.sum(), 1, atol=1e-6)
+    expected = actions[0][..., g["mppi_elites"]]
+    assert np.array_equal(np.sort(elites[0], axis=-1), np.sort(expected, axis=-1))
+    # a weight is exp of a return: an error of 1e-5 in the return is one of 1e-5 in the weight
+    assert np.abs(mean[0] - g["mppi_refined"]).max() < 1e-4
+    std = np.sqrt((weights[0] * (elites[0] - mean[0][..., None]) ** 2).sum(-1))
+    assert np.abs(np.clip(std, config.min_std, config.max_std) - g["mppi_std"]).max() < 1e-4
+
+
+def golden_student(header, g, expert, dtype):
+    """The stored student and its batch, with the expert's part computed in `dtype`."""
+    expert = fac.WorldModel(expert.config, {k: v.astype(dtype) for k, v in expert.params.items()})
+    student = fac.WorldModel(fac.ModelConfig(**header["student"]), {
+        k[len("student "):]: v.astype(dtype) for k, v in g.items() if k.startswith("student ")})
+    features = expert.encode(g["kl_obs"].astype(dtype))
+    batch = features, g["kl_actions"].astype(dtype)
+    return student, (*batch, fac.predict(expert, *batch)), fac.DistillConfig(**header["distill"])
+
+
+def ten_steps(student, batch, config, lr, losses, check_gradients=lambda grads: None):
+    """Adam as Distiller runs it; returns the weights by name and whether every step clipped."""
+    vector, views = fac.flatten(student.params)
+    gradient, grads = fac.flatten({k: np.zeros_like(v) for k, v in views.items()})
+    student, clipped = fac.WorldModel(student.config, views), True
+    adam = fac.Adam(len(vector), vector.dtype)
+    for step, expected in enumerate(losses):
+        gradient[:] = 0
+        loss, _, _ = fac.distill_loss(student, *batch, config, grads)
+        assert abs(loss / expected - 1) < ADAM
+        if step == 0:
+            check_gradients(grads)
+        clipped &= fac.clip_norm(gradient, config.grad_clip) > config.grad_clip
+        adam.step(vector, gradient, lr)
+    return views, clipped
+
+
+def test_kl_loss_and_gradients(golden):
+    expert, header, g = golden
+    student, batch, config = golden_student(header, g, expert, np.float32)
+    grads = {k: np.zeros_like(v) for k, v in student.params.items()}
+    loss, _, _ = fac.distill_loss(student, *batch, config, grads)
+    assert abs(loss / g["kl_loss"] - 1) < FORWARD
+    for key, gradient in grads.items():
+        if key in fac.UNSEEN:
+            assert np.abs(gradient).max() < 1e-6
+        else:
+            assert_digest(gradient, g[f"kl_grad {key}"], GRADIENT)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_ten_adam_steps(golden, dtype):
+    # Adam divides a gradient by its own size, so it makes as much of one that float32 rounds away
+    # as of any other: biases, which start at zero, show that, and are compared in float64
+    expert, header, g = golden
+    student, batch, config = golden_student(header, g, expert, dtype)
+    views, _ = ten_steps(student, batch, config, config.lr, g["adam_losses"])
+    for key, value in views.items():
+        if key.endswith("weight") or (dtype == np.float64 and key not in fac.UNSEEN):
+            assert_digest(value, g[f"adam {key}"], ADAM)
+
+
+# ------------------------------------------------------- the narrow networks, in full
+
+NARROW = fac.DATA / "golden-narrow.npz"
+
+
+def narrow_case(tag, dtype):
+    header, arrays = fac.read_npz(NARROW, ("golden",))
+    g = {k[len(tag) + 1:]: v for k, v in arrays.items() if k.startswith(tag + " ")}
+    config = header["configs"][tag]
+    student = fac.WorldModel(fac.ModelConfig(**config["student"]), {
+        k[len("weight "):]: v.astype(dtype) for k, v in g.items() if k.startswith("weight ")})
+    batch = [g[k].astype(dtype) for k in ("features", "actions", "targets")]
+    return student, batch, g, fac.DistillConfig(**config["distill"])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("kind", ["forward", "reverse"])
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
+def test_narrow_students(n, kind, dtype):
+    student, batch, g, config = narrow_case(f"{n} {kind}", dtype)
+    outputs = fac.predict(student, student.encode_features(batch[0]), batch[1])
+    for found, expected in zip(outputs, g["outputs"]):
+        assert relative(found, expected) < FORWARD
+
+    def check_gradients(grads):
+        for key, found in grads.items():
+            if key in fac.UNSEEN:
+                assert np.abs(found).max() < 1e-6
+            else:
+                assert relative(found, g[f"grad {key}"]) < GRADIENT, key
+
+    views, clipped = ten_steps(student, batch, config, 1e-3, g["adam_losses"], check_gradients)
+    assert clipped, "the case should clip"
+    for key, found in views.items():
+        if key.endswith("weight") or (dtype == np.float64 and key not in fac.UNSEEN):
+            assert relative(found, g[f"adam {key}"]) < ADAM, key
+
+
+def test_narrow_expert_forward():
+    header, g = fac.read_npz(NARROW, ("golden",))
+    training = header["training"]
+    config = fac.ModelConfig(7, 6, 1, training["latent_dim"], training["enc_dim"],
+                             training["mlp_dim"])
+    params = {}
+    for key, value in g.items():
+        if key.startswith("model "):
+            norm = key.split(".")[1] == "1"
+            params[key[6:]] = value[None, :, None] if norm or key.endswith("bias") else value[None]
+    model = fac.WorldModel(config, params)
+    z = model.encode(g["obs"][0])
+    a = g["action"][0][None]
+    q1, q2 = model.q(z, a)
+    for name, found in (("latent", z), ("next_latent", model.next(z, a)), ("q1", q1), ("q2", q2),
+                        ("reward", model.reward(z, a)), ("policy", model.policy(z))):
+        assert relative(found[0], g[name]) < FORWARD, name

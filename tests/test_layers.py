@@ -1,0 +1,274 @@
+"""Every backward pass against central differences in float64, and against live PyTorch."""
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import fac_tdmpc_ref as fac
+
+SHAPES = [(1, 5, 4, 1), (1, 3, 7, 6), (3, 4, 5, 2), (2, 6, 3, 1)]  # N, in, out, B
+
+
+def numeric_gradient(function, x, step=1e-6):
+    """Central differences of a scalar function of the array x (changed in place and back)."""
+    gradient = np.zeros_like(x)
+    for i in np.ndindex(x.shape):
+        kept = x[i]
+        x[i] = kept + step
+        above = function()
+        x[i] = kept - step
+        below = function()
+        x[i] = kept
+        gradient[i] = (above - below) / (2 * step)
+    return gradient
+
+
+def assert_close(found, expected, tolerance=1e-7):
+    scale = max(np.abs(expected).max(), 1e-3)
+    assert np.abs(found - expected).max() <= tolerance * scale, np.abs(found - expected).max()
+
+
+@pytest.mark.parametrize("n, inputs, outputs, batch", SHAPES)
+def test_linear_backward(n, inputs, outputs, batch):
+    rng = np.random.default_rng(0)
+    x, W, b = (rng.standard_normal(s) for s in ((n, inputs, batch), (n, outputs, inputs),
+                                                (n, outputs, 1)))
+    dy = rng.standard_normal((n, outputs, batch))
+    for found, array in zip(fac.linear_backward(dy, x, W), (x, W, b)):
+        assert_close(found, numeric_gradient(lambda: (fac.linear(x, W, b) * dy).sum(), array))
+
+
+@pytest.mark.parametrize("n, features, _, batch", SHAPES)
+def test_norm_backward(n, features, _, batch):
+    rng = np.random.default_rng(1)
+    x, g, b = (rng.standard_normal(s) for s in ((n, features, batch), (n, features, 1),
+                                                (n, features, 1)))
+    dy = rng.standard_normal(x.shape)
+    for found, array in zip(fac.norm_backward(dy, x, g), (x, g, b)):
+        assert_close(found, numeric_gradient(lambda: (fac.norm(x, g, b) * dy).sum(), array), 1e-6)
+
+
+@pytest.mark.parametrize("forward, backward", [(fac.elu, fac.elu_backward),
+                                               (np.tanh, fac.tanh_backward)])
+def test_activation_backward(forward, backward):
+    rng = np.random.default_rng(2)
+    x, dy = rng.standard_normal((2, 2, 4, 5))
+    numeric = numeric_gradient(lambda: (forward(x) * dy).sum(), x)
+    assert_close(backward(dy, forward(x)), numeric)
+
+
+@pytest.mark.parametrize("kinds", [fac.ENCODER, fac.MLP, fac.QNET])
+@pytest.mark.parametrize("n, batch", [(1, 1), (3, 4)])
+def test_network_backward(kinds, n, batch):
+    rng = np.random.default_rng(3)
+    params, width = {}, 4
+    for i, kind in enumerate(kinds):
+        out = 3 if i == len(kinds) - 1 else 6
+        if kind == "linear":
+            params[f"f.{i}.weight"], width = rng.standard_normal((n, out, width)), out
+        if kind == "norm":
+            params[f"f.{i}.weight"] = rng.standard_normal((n, width, 1))
+        if kind in ("linear", "norm"):
+            params[f"f.{i}.bias"] = rng.standard_normal((n, width, 1))
+    x, dy = rng.standard_normal((n, 4, batch)), rng.standard_normal((n, 3, batch))
+
+    def loss():
+        return (fac.forward(kinds, params, "f", x) * dy).sum()
+
+    tape, grads = [], {k: np.zeros_like(v) for k, v in params.items()}
+    fac.forward(kinds, params, "f", x, tape)
+    assert_close(fac.backward(kinds, params, "f", tape, dy, grads), numeric_gradient(loss, x), 1e-6)
+    for key, value in params.items():
+        assert_close(grads[key], numeric_gradient(loss, value), 1e-6)
+
+
+def test_arena_gives_the_same_arrays_and_results():
+    arena, rng = fac.Arena(), np.random.default_rng(4)
+    x, W, b = (rng.standard_normal(s) for s in ((2, 3, 5), (2, 4, 3), (2, 4, 1)))
+    first = fac.elu(fac.linear(x, W, b, arena.empty), arena.empty)
+    kept = first.copy()
+    arena.rewind()
+    again = fac.elu(fac.linear(x, W, b, arena.empty), arena.empty)
+    assert again is first
+    assert np.array_equal(again, kept) and np.array_equal(kept, fac.elu(fac.linear(x, W, b)))
+
+
+@pytest.mark.parametrize("kind", ["forward", "reverse"])
+def test_soft_kl(kind):
+    rng = np.random.default_rng(5)
+    student, expert = rng.standard_normal((2, 3, 4, 6))
+    kl, gradient = fac.soft_kl(student, expert, 0.7, 0.4, kind)
+    assert (kl > 0).all()
+    assert_close(gradient, numeric_gradient(
+        lambda: fac.soft_kl(student, expert, 0.7, 0.4, kind)[0].sum(), student))
+    # the definition, and its zero: predictions that differ by a constant and the temperatures
+    p, q = (np.exp(x / t) / np.exp(x / t).sum(-1, keepdims=True)
+            for x, t in ((expert, 0.4), (student, 0.7)))
+    if kind == "reverse":
+        p, q = q, p
+    assert np.allclose(kl, (p * np.log(p / q)).sum(-1))
+    assert np.allclose(fac.soft_kl(expert * 0.7 / 0.4 + 3, expert, 0.7, 0.4, kind)[0], 0)
+
+
+def small_case(n, batch, steps, kind, rng, expert_latent=0):
+    """A float64 student with live last layers, and a batch for it."""
+    sizes = fac.ModelConfig(4, 6, n, 3, 5, 6, expert_latent_dim=expert_latent, expert_enc_dim=4)
+    student = fac.WorldModel.create(sizes, rng, dtype=np.float64)
+    for value in student.params.values():
+        value += 0.3 * rng.standard_normal(value.shape)
+    features = rng.standard_normal((1, expert_latent or 4, batch))
+    actions = rng.uniform(-1, 1, (steps, 6, batch, 3))
+    targets = rng.standard_normal((3, steps, batch, 3))
+    config = fac.DistillConfig(lam=0.7, kl=kind, temperature_student=0.8)
+    return student, features, actions, targets, config
+
+
+@pytest.mark.parametrize("n, batch, steps, kind, latent", [
+    (1, 1, 4, "forward", 0), (2, 3, 3, "reverse", 5), (3, 1, 2, "forward", 5),
+    (6, 2, 4, "reverse", 0), (3, 2, 1, "forward", 0)])
+def test_distill_loss_through_the_rollout(n, batch, steps, kind, latent):
+    rng = np.random.default_rng(6)
+    student, *case = small_case(n, batch, steps, kind, rng, latent)
+    grads = {k: np.zeros_like(v) for k, v in student.params.items()}
+    fac.distill_loss(student, *case, grads)
+    for key, value in student.params.items():
+        expected = numeric_gradient(lambda: fac.distill_loss(student, *case)[0], value)
+        assert_close(grads[key], expected, 1e-5)
+        if not (key.startswith("_expert") or key in fac.UNSEEN) and steps > 1:
+            assert np.abs(expected).max() > 1e-7, f"{key}: the check compares zeros"
+
+
+def test_predict_is_the_step_by_step_rollout():
+    rng = np.random.default_rng(7)
+    student, features, actions, _, _ = small_case(3, 2, 4, "forward", rng)
+    z = student.encode_features(features)
+    found = fac.predict(student, z, actions)
+    z = np.repeat(z, 3, axis=2)
+    for h in range(4):
+        a = actions[h].reshape(3, 2, 6)
+        for output, share in zip(found, (student.reward(z, a), *student.q(z, a))):
+            assert np.allclose(output[h], share.sum(0).reshape(2, 3))
+        z = student.next(z, a)
+
+
+def test_orthogonal():
+    rng = np.random.default_rng(8)
+    for rows, columns in ((5, 3), (3, 5), (4, 4)):
+        W = fac.orthogonal(rng, 2, rows, columns, np.float64)
+        assert W.shape == (2, rows, columns)
+        product = W @ W.swapaxes(1, 2) if rows <= columns else W.swapaxes(1, 2) @ W
+        assert np.allclose(product, np.eye(min(rows, columns)))
+
+
+def test_create_follows_told():
+    sizes = fac.ModelConfig(8, 3, 3, 50, 256, 170)
+    params = fac.WorldModel.create(sizes, np.random.default_rng(0)).params
+    assert all(v.dtype == np.float32 for v in params.values())
+    assert all(not params[f"{name}.weight"].any() for name in ("_reward.4", "_Q1.5", "_Q2.5"))
+    assert all(not v.any() for k, v in params.items() if k.endswith("bias"))
+    assert (params["_Q1.1.weight"] == 1).all()
+
+
+def test_agents_must_divide_the_actions():
+    with pytest.raises(fac.UserError, match=r"one of \[1, 2, 3, 6\]"):
+        fac.ModelConfig(8, 6, 4)
+
+
+def test_clip_norm():
+    vector = np.array([3.0, 4.0])
+    assert fac.clip_norm(vector, 10) == 5 and vector.tolist() == [3, 4]
+    assert fac.clip_norm(vector, 1) == 5 and np.isclose(np.linalg.norm(vector), 1, atol=1e-6)
+
+
+def test_flatten_gives_views():
+    arrays = {"a": np.ones((2, 3), np.float32), "b": np.zeros((4, 1), np.float32)}
+    vector, views = fac.flatten(arrays)
+    vector[:] = np.arange(10)
+    assert views["a"].shape == (2, 3) and views["b"][:, 0].tolist() == [6, 7, 8, 9]
+
+
+# ------------------------------------------------------------------------- live PyTorch
+
+shapes = st.tuples(st.integers(1, 4), st.integers(1, 7), st.integers(2, 8), st.integers(1, 5))
+
+
+@settings(max_examples=25, deadline=None)
+@given(shapes, st.integers(0, 2 ** 31))
+def test_networks_against_torch(shape, seed):
+    torch = pytest.importorskip("torch")
+    train_expert = import_train_expert()
+    n, inputs, hidden, batch = shape
+    rng = np.random.default_rng(seed)
+    config = fac.ModelConfig(3, n * 2, n, inputs, 5, hidden)
+    model = fac.WorldModel.create(config, rng, dtype=np.float64)
+    for value in model.params.values():
+        value += 0.3 * rng.standard_normal(value.shape)
+    x = rng.standard_normal((n, inputs + 2, batch))
+    for name, kinds in (("_dynamics", fac.MLP), ("_Q1", fac.QNET)):
+        theirs = {k: torch.tensor(v, requires_grad=True) for k, v in model.params.items()}
+        their_x = torch.tensor(x, requires_grad=True)
+        output = train_expert.run_network(kinds, theirs, name, their_x)
+        dy = rng.standard_normal(output.shape)
+        (output * torch.tensor(dy)).sum().backward()
+        tape, grads = [], {k: np.zeros_like(v) for k, v in model.params.items()}
+        assert_close(fac.forward(kinds, model.params, name, x, tape), output.detach().numpy(), 1e-9)
+        assert_close(fac.backward(kinds, model.params, name, tape, dy, grads),
+                     their_x.grad.numpy(), 1e-7)
+        for key, value in theirs.items():
+            if value.grad is not None:
+                assert_close(grads[key], value.grad.numpy(), 1e-7)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.sampled_from([1, 2, 3, 6]), st.integers(1, 4), st.integers(1, 4),
+       st.sampled_from(["forward", "reverse"]), st.integers(0, 2 ** 31))
+def test_distill_loss_against_torch(n, batch, steps, kind, seed):
+    torch = pytest.importorskip("torch")
+    train_expert = import_train_expert()
+    student, features, actions, targets, config = small_case(n, batch, steps, kind,
+                                                             np.random.default_rng(seed))
+    theirs = {k: torch.tensor(v, requires_grad=True) for k, v in student.params.items()}
+    loss = train_expert.equation_4(theirs, torch.tensor(features), torch.tensor(actions),
+                                   [torch.tensor(t) for t in targets], n, config)
+    grads = {k: np.zeros_like(v) for k, v in student.params.items()}
+    ours = fac.distill_loss(student, features, actions, targets, config, grads)[0]
+    assert np.isclose(ours, loss.item(), rtol=1e-10)
+    for key, expected in train_expert.gradients(loss, theirs).items():
+        assert_close(grads[key], expected, 1e-7)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(1, 6), st.floats(1e-5, 1e-1), st.floats(0.01, 10), st.integers(0, 2 ** 31))
+def test_adam_and_clipping_against_torch(size, lr, clip, seed):
+    torch = pytest.importorskip("torch")
+    rng = np.random.default_rng(seed)
+    ours = rng.standard_normal(size)
+    theirs = torch.tensor(ours, requires_grad=True)
+    adam, optimizer = fac.Adam(size, np.float64), torch.optim.Adam([theirs], lr=lr)
+    for _ in range(5):
+        gradient = rng.standard_normal(size)
+        theirs.grad = torch.tensor(gradient)
+        torch.nn.utils.clip_grad_norm_([theirs], clip)
+        optimizer.step()
+        fac.clip_norm(gradient, clip)
+        adam.step(ours, gradient, lr)
+        assert np.allclose(ours, theirs.detach().numpy(), rtol=1e-9, atol=1e-12)
+
+
+def import_train_expert():
+    import importlib.util
+    spec = importlib.util.spec_from_file_location("train_expert", fac.DATA / "train_expert.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_configs_refuse_nonsense():
+    for wrong in ({"kl": "sideways"}, {"steps": 0}, {"noise_samples": 1}, {"lr": 0.0},
+                  {"temperature_expert": -1.0}, {"held_out": 1.0}):
+        with pytest.raises(fac.UserError, match=next(iter(wrong))):
+            fac.DistillConfig(**wrong)
+    for f in dataclasses.fields(fac.DistillConfig):
+        assert f.metadata["help"]

@@ -1,0 +1,263 @@
+"""MPPI on problems with known answers, Proposition 1, the fast returns, and the workers."""
+import os
+import signal
+import subprocess
+import sys
+import time
+from itertools import product
+
+import numpy as np
+import pytest
+
+import fac_tdmpc_ref as fac
+
+
+def random_model(n=3, dim_action=3, latent=6, hidden=24, seed=0, policy=False):
+    sizes = fac.ModelConfig(8, dim_action, n, latent, 16, hidden)
+    rng = np.random.default_rng(seed)
+    model = fac.WorldModel.create(sizes, rng, policy)
+    for value in model.params.values():
+        value += 0.3 * rng.standard_normal(value.shape, np.float32)
+    return model
+
+
+def streams(n, seed=0):
+    return [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(n)]
+
+
+def quadratic(target):
+    """G = -|a - target|^2 for each agent: a linear-quadratic problem with optimum `target`."""
+    return lambda actions: -((actions - target[..., None]) ** 2).sum((1, 2))
+
+
+CONFIG = fac.PlannerConfig(samples=512, iterations=20, temperature=2.0, min_std=0.01)
+
+
+@pytest.mark.parametrize("n, d", [(1, 3), (3, 1), (2, 2)])
+def test_mppi_reaches_the_optimum(n, d):
+    target = np.random.default_rng(0).uniform(-0.8, 0.8, (n, 4, d)).astype(np.float32)
+    mean, elites, weights = fac.mppi(quadratic(target), np.zeros_like(target), CONFIG, streams(n))
+    assert np.abs(mean - target).max() < 0.1
+    assert mean.dtype == elites.dtype == weights.dtype == np.float32
+    assert np.allclose(weights.sum(1), 1, atol=1e-6) and (weights >= 0).all()
+    assert elites.shape == (n, 4, d, CONFIG.elites)
+
+
+def test_mppi_respects_the_bounds():
+    target = np.full((2, 4, 1), 3, np.float32)  # outside: the best allowed action is 1
+    mean, elites, _ = fac.mppi(quadratic(target), np.zeros_like(target), CONFIG, streams(2))
+    assert np.abs(elites).max() <= 1 and np.abs(mean).max() <= 1 and mean.min() > 0.9
+
+
+def test_elites_are_the_best_of_each_agent():
+    seen = []
+
+    def returns(actions):
+        G = quadratic(np.zeros((2, 3, 1), np.float32))(actions)
+        seen.append((actions, G))
+        return G
+
+    config = fac.PlannerConfig(samples=40, elites=5, iterations=1)
+    _, elites, weights = fac.mppi(returns, np.zeros((2, 3, 1), np.float32), config, streams(2))
+    actions, G = seen[0]
+    for i in range(2):
+        best = np.argsort(-G[i])[:5]
+        assert sorted(map(tuple, elites[i][..., :].reshape(3, -1).T.tolist())) == \
+            sorted(map(tuple, actions[i][..., best].reshape(3, -1).T.tolist()))
+        score = np.exp(config.temperature * (np.sort(G[i])[::-1][:5] - G[i].max()))
+        assert np.allclose(np.sort(weights[i])[::-1], score / score.sum(), atol=1e-6)
+
+
+def test_proposals_compete():
+    target = np.array([[[0.3], [-0.4]]], np.float32)
+    config = fac.PlannerConfig(samples=8, elites=1, iterations=1, momentum=0.0)
+    mean, _, _ = fac.mppi(quadratic(target), np.zeros_like(target), config, streams(1),
+                          target[..., None])
+    assert np.allclose(mean, target)
+
+
+@pytest.mark.parametrize("value_at", ["after", "last"])
+@pytest.mark.parametrize("horizon", [3, 1])
+@pytest.mark.parametrize("n", [1, 3])
+def test_fast_returns_are_equation_2(n, value_at, horizon):
+    model = random_model(n)
+    config = fac.PlannerConfig(horizon=horizon, value_at=value_at)
+    rng = np.random.default_rng(1)
+    fast = fac.Returns(model, config)
+    for samples in (299, 5):  # two blocks, the last narrower; then buffers of another size
+        z = model.encode(rng.standard_normal((8, 1), np.float32))
+        actions = rng.uniform(-1, 1, (n, config.rewards + 1, 3 // n, samples)).astype(np.float32)
+        fast.start(z)
+        plain = fac.h_step_return(model, z, actions, config)
+        assert fast(actions).dtype == np.float32
+        assert np.abs(fast(actions) - plain).max() < 1e-5 * np.abs(plain).max()
+
+
+def test_value_at_last_is_one_step_shorter():
+    model, rng = random_model(), np.random.default_rng(2)
+    z = model.encode(rng.standard_normal((8, 1), np.float32))
+    actions = rng.uniform(-1, 1, (3, 3, 1, 7)).astype(np.float32)
+    after = fac.h_step_return(model, z, actions, fac.PlannerConfig(horizon=2))
+    last = fac.h_step_return(model, z, actions, fac.PlannerConfig(horizon=3, value_at="last"))
+    assert np.array_equal(after, last)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_proposition_1(seed):
+    """The best joint sequence is the best of each agent: all 5^(2 * 3) joint ones are tried."""
+    model = random_model(n=3, seed=seed)
+    config, grid = fac.PlannerConfig(horizon=1), np.linspace(-1, 1, 5)
+    z = model.encode(np.random.default_rng(seed).standard_normal((8, 1)).astype(np.float32))
+    own = np.array(list(product(grid, repeat=2)), np.float32).T  # (L, 25)
+    individual = fac.h_step_return(model, z, np.broadcast_to(own[None, :, None], (3, 2, 1, 25)),
+                                   config)
+    joint = np.array(list(product(range(25), repeat=3)))
+    actions = own[:, joint].transpose(2, 0, 1)[:, :, None]  # (N, L, 1, 25^3)
+    total = fac.h_step_return(model, z, np.ascontiguousarray(actions), config).sum(0)
+    assert np.array_equal(joint[total.argmax()], individual.argmax(1))
+
+
+def test_warm_start_shifts_by_one():
+    model = random_model()
+    planner = fac.AgentPlanner(model, fac.PlannerConfig(samples=32, iterations=1))
+    planner.reset(np.random.SeedSequence(0).spawn(3))
+    z = model.encode(np.zeros((8, 1), np.float32))
+    planner.returns.start(z)
+    twin = fac.AgentPlanner(model, planner.config)
+    twin.reset(np.random.SeedSequence(0).spawn(3))
+    mean, _, _ = fac.mppi(planner.returns, planner.mean, planner.config, twin.rngs)
+    planner.plan(z)
+    assert np.array_equal(planner.mean[:, :-1], mean[:, 1:])
+    assert not planner.mean[:, -1].any() and planner.mean[:, :-1].any()
+    planner.reset([])
+    assert not planner.mean.any()
+
+
+@pytest.mark.parametrize("output", ["sampled", "mean"])
+@pytest.mark.parametrize("n", [1, 3])
+def test_same_seed_same_plan(n, output):
+    model = random_model(n, policy=n == 1)
+    config = fac.PlannerConfig(samples=48, iterations=2, output=output)
+    obs = np.random.default_rng(3).standard_normal((4, 8))
+    plans = []
+    for seed in (5, 5, 6):
+        with fac.Planner(model, config, seed=seed) as planner:
+            plans.append(np.array([planner.act(o) for o in obs]))
+            planner.reset(seed)
+            assert np.array_equal([planner.act(o) for o in obs], plans[-1])
+    assert np.array_equal(plans[0], plans[1]) and not np.array_equal(plans[0], plans[2])
+    assert plans[0].dtype == np.float32 and np.abs(plans[0]).max() <= 1
+
+
+def test_policy_proposals_change_the_plan_of_the_expert_only():
+    obs = np.ones(8)
+    for n, differs in ((1, True), (3, False)):
+        model = random_model(n, policy=n == 1)
+        a, b = (fac.Planner(model, fac.PlannerConfig(samples=16, iterations=1, pi_trajs=p,
+                                                     output="mean")).act(obs) for p in (0, 24))
+        assert np.array_equal(a, b) != differs
+
+
+def test_an_observation_of_the_wrong_size_is_refused():
+    with pytest.raises(fac.UserError, match=r"\(8,\), found \(7,\)"):
+        fac.Planner(random_model()).act(np.zeros(7))
+
+
+def test_planner_config_refuses_nonsense():
+    for wrong, text in (({"elites": 9, "samples": 8}, "elites"), ({"horizon": 0}, "horizon"),
+                        ({"min_std": 3.0}, "min_std"), ({"output": "best"}, "output")):
+        with pytest.raises(fac.UserError, match=text):
+            fac.PlannerConfig(**wrong)
+    assert fac.PlannerConfig().elites == 64
+
+
+# ------------------------------------------------------------------------------- workers
+
+def shared_memory():
+    return sorted(os.listdir("/dev/shm")) if os.path.isdir("/dev/shm") else []
+
+
+@pytest.mark.parametrize("n, d, workers", [(3, 1, 1), (3, 1, 2), (2, 3, 1), (6, 1, 3)])
+def test_workers_plan_the_same_bit_for_bit(n, d, workers):
+    model = random_model(n, n * d, hidden=50)
+    config = fac.PlannerConfig(samples=200, iterations=3)
+    obs = np.random.default_rng(4).standard_normal((4, 8))
+    before = shared_memory()
+    with fac.Planner(model, config, seed=1) as alone, \
+            fac.Planner(model, config, seed=1, workers=workers) as parallel:
+        for seed in (None, 9):
+            if seed:
+                alone.reset(seed), parallel.reset(seed)
+            for o in obs:
+                assert np.array_equal(alone.act(o), parallel.act(o))
+    assert shared_memory() == before
+
+
+def test_too_many_workers_are_refused():
+    with pytest.raises(fac.UserError, match="0 to 2"):
+        fac.Planner(random_model(), workers=3)
+
+
+def test_a_dead_worker_is_reported_and_nothing_hangs():
+    with fac.Planner(random_model(), fac.PlannerConfig(samples=16), workers=2) as planner:
+        planner.act(np.zeros(8))
+        processes = [process for process, _ in planner._workers._members]
+        os.kill(processes[0].pid, signal.SIGKILL)
+        began = time.monotonic()
+        with pytest.raises(fac.WorkerError, match="worker 0 ended with exit code -9"):
+            for _ in range(3):
+                planner.act(np.zeros(8))
+        assert time.monotonic() - began < 5  # a hang would last for ever
+        assert not any(process.is_alive() for process in processes)
+
+
+SCRIPT = """
+import sys, time
+sys.path.insert(0, {root!r})
+import numpy as np
+import fac_tdmpc_ref as fac
+from test_planning import random_model
+
+if __name__ == "__main__":
+    planner = fac.Planner(random_model(), fac.PlannerConfig(samples=16), workers=2)
+    planner.act(np.zeros(8))
+    print(*[process.pid for process, _ in planner._workers._members], flush=True)
+    while True:
+        planner.act(np.zeros(8))
+"""
+
+
+@pytest.mark.parametrize("blow", [signal.SIGINT, signal.SIGKILL])
+def test_workers_end_with_their_parent(blow, tmp_path):
+    script = tmp_path / "plan.py"
+    script.write_text(SCRIPT.format(root=os.path.dirname(os.path.abspath(__file__))))
+    before = shared_memory()
+    environment = {**os.environ, "PYTHONPATH": str(fac.DATA.parent)}
+    process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True,
+                               stderr=subprocess.PIPE, env=environment, start_new_session=True)
+    pids = [int(word) for word in process.stdout.readline().split()]
+    assert len(pids) == 2
+    if blow == signal.SIGINT:
+        os.killpg(process.pid, blow)  # as a terminal does: to all of them
+    else:
+        process.kill()
+    _, errors = process.communicate(timeout=20)
+    for _ in range(100):
+        if not any(os.path.exists(f"/proc/{pid}/cmdline") and
+                   open(f"/proc/{pid}/cmdline").read() for pid in pids):
+            break
+        time.sleep(0.1)
+    else:
+        pytest.fail("a worker outlived its parent")
+    assert errors.count("Traceback") <= 1, "only the parent may report the interrupt"
+    assert shared_memory() == before
+
+
+def test_an_unguarded_script_gets_an_error_not_a_hang(tmp_path):
+    script = tmp_path / "plan.py"
+    script.write_text(f"import sys\nsys.path[:0] = [{str(fac.DATA.parent)!r}, "
+                      f"{os.path.dirname(os.path.abspath(__file__))!r}]\n"
+                      "import fac_tdmpc_ref as fac\nfrom test_planning import random_model\n"
+                      "fac.Planner(random_model(hidden=400), workers=1)\n")
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60)
+    assert done.returncode != 0 and "__main__" in done.stderr
