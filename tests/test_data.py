@@ -3,8 +3,8 @@
 import errno
 import json
 import os
-import zipfile
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -189,10 +189,9 @@ def test_pickles_are_refused(tmp_path, expert_file):
     assert not (tmp_path / "ran").exists()
 
 
-@pytest.mark.parametrize("header", [None, b"{", b"\xff\xfe", [1, 2], None.__class__, "text"])
+@pytest.mark.parametrize("header", [None, b"{", b"\xff\xfe", [1, 2], b"null", "text"])
 def test_header_missing_or_no_json_object(tmp_path, expert_file, header):
     _, arrays = contents(expert_file)
-    header = b"null" if header is type(None) else header
     path = write_raw(tmp_path / "m.npz", header, arrays)
     refusal(lambda: fac.load_model(path), path, "header")
 
@@ -536,7 +535,8 @@ def test_digest_keeps_norm_product_and_entries():
     flat = array.astype(np.float64).ravel()
     assert found.shape == (66,) and found.dtype == np.float64
     np.testing.assert_allclose(found[0] ** 2, sum(v * v for v in flat), rtol=1e-12)
-    product = sum(v * np.cos(i * i % 1009) for i, v in enumerate(flat))
+    fixed = [np.cos(i * i % 1009) for i in range(300)]
+    product = sum(f * v for f, v in zip(fixed, flat)) / sum(f * f for f in fixed) ** 0.5
     np.testing.assert_allclose(found[1], product, rtol=1e-9)
     assert found[2] == flat[0] and found[-1] == flat[-1] and np.isin(found[2:], flat).all()
 

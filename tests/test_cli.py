@@ -1,0 +1,569 @@
+"""Tests of section 9: the command line as users run it, on a small expert and replay made here."""
+
+import csv
+import dataclasses
+import importlib.util
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import fac_tdmpc_ref as fac  # noqa: E402
+
+SCRIPT = ROOT / "fac_tdmpc_ref.py"
+STEPS = 6
+BUDGET = ["--samples", "16", "--iterations", "1"]
+TINY = ["--steps", str(STEPS), "--batch-size", "4", "--horizon", "1", "--held-out", "0.34",
+        "--warmup", "2", "--episodes", "1", "--plan-samples", "16", "--plan-iterations", "1"]
+# BLAS threads that wait for a busy core make runs many times longer
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+KEYS = {"task", "seed", "steps", "seconds", "expert_return_mean", "expert_return_std",
+        "student_return_mean", "student_return_std", "episodes", "kl_reward", "kl_value",
+        "rank_correlation", "plan_ms_expert", "plan_ms_student", "speedup", "expert_recorded", "out"}
+
+
+def write_expert(path, task="reacher-hard", dims=(8, 3), seed=0, latent=6):
+    rng = np.random.default_rng(seed)
+    config = fac.ModelConfig(*dims, num_agents=1, latent_dim=latent, enc_dim=16, mlp_dim=24)
+    model = fac.WorldModel.create(config, rng, policy=True)
+    for key in ("_reward.4.weight", "_Q1.5.weight", "_Q2.5.weight"):  # zero: nothing to learn from
+        model.params[key] = rng.standard_normal(model.params[key].shape, np.float32)
+    fac.save_model(path, model, {"kind": "expert", "task": task})
+
+
+def write_replay(path, dims=(8, 3), episodes=6, rows=30):
+    rng, n = np.random.default_rng(1), episodes * rows
+    fac.write_npz(path, {"kind": "replay"}, {
+        "observation": rng.standard_normal((n, dims[0])).astype(np.float16),
+        "action": rng.uniform(-1, 1, (n, dims[1])).astype(np.float16),
+        "continues": np.arange(1, n + 1) % rows != 0})
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A folder with an expert, a replay and things that are neither."""
+    folder = tmp_path_factory.mktemp("files")
+    write_expert(folder / "expert.npz")
+    write_expert(folder / "other.npz", seed=1)
+    write_expert(folder / "wider.npz", latent=7)
+    write_replay(folder / "replay.npz")
+    write_replay(folder / "walker.npz", dims=(24, 6))
+    (folder / "corrupt.npz").write_bytes((folder / "expert.npz").read_bytes()[:3000])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def no_plots(tmp_path_factory):
+    """Settings under which matplotlib can't be imported; runs end sooner without it, too."""
+    folder = tmp_path_factory.mktemp("blocked")
+    (folder / "matplotlib.py").write_text("raise ImportError('blocked by a test')\n")
+    return {"PYTHONPATH": str(folder), **ONE_THREAD}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """What runs in this process, as well."""
+    with fac.one_thread():
+        yield
+
+
+def launch(command, cwd, env=ONE_THREAD):
+    return subprocess.run([sys.executable, *map(str, command)], cwd=cwd, capture_output=True,
+                          text=True, encoding="utf-8", timeout=120,
+                          env={**os.environ, "PYTHONIOENCODING": "utf-8", **env})
+
+
+def run(*arguments, cwd, env=ONE_THREAD):
+    return launch([SCRIPT, *arguments], cwd, env)
+
+
+def distill_arguments(files, *more):
+    return ["distill", "--expert", files / "expert.npz", "--replay", files / "replay.npz", *TINY,
+            *more]
+
+
+def succeeded(done):
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def last_json(done):
+    """The last line of stdout, as strict JSON: NaN and Infinity are none."""
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(succeeded(done).stdout.splitlines()[-1], parse_constant=refuse)
+
+
+def student_of(folder):
+    """{key: bytes} of a student's weights, and its header."""
+    model, header = fac.load_model(folder / "student.npz")
+    return {k: v.tobytes() for k, v in model.params.items()}, header
+
+
+# help ---------------------------------------------------------------------------------
+
+WATCHED = f"""
+import os, sys
+sys.path.insert(0, {str(ROOT)!r})
+def refuse(*_):
+    raise RuntimeError("a process was started")
+def audit(event, _):
+    if event in ("subprocess.Popen", "os.fork", "os.posix_spawn", "os.system", "os.exec"):
+        refuse()
+sys.addaudithook(audit)
+import _posixsubprocess
+_posixsubprocess.fork_exec = refuse   # what multiprocessing starts processes with, unaudited
+import fac_tdmpc_ref as fac
+try:
+    fac.main(sys.argv[1:])
+except SystemExit as end:
+    heavy = {{"mujoco", "dm_control", "matplotlib", "torch", "scipy", "tqdm"}} & set(sys.modules)
+    assert not heavy, heavy
+    sys.exit(end.code)
+"""
+
+
+@pytest.mark.parametrize("command, expected", [
+    ((), ["distill", "evaluate"]),
+    (("distill",), ["--task", "--preset", "--num-agents", "--evaluate-expert", "--plan-samples",
+                    "[12000; paper: 100000]", "[forward; paper: reverse]", "reacher-hard"]),
+    (("evaluate",), ["--model", "--record", "--samples", "--output", "[6]"])])
+def test_help_is_quick_and_starts_nothing(tmp_path, command, expected):
+    done = succeeded(launch(["-c", WATCHED, *command, "--help"], tmp_path))
+    text = re.sub(r"\s+", " ", done.stdout)
+    assert text.startswith("usage: fac_tdmpc_ref.py") and done.stderr == ""
+    for part in expected:
+        assert part in text
+    assert os.listdir(tmp_path) == []
+
+
+def test_every_setting_has_a_flag_in_help():
+    subparsers = fac.make_parser()._subparsers._group_actions[0].choices
+    for command, config_class, prefix in (("distill", fac.DistillConfig, ""),
+                                          ("distill", fac.PlannerConfig, "plan-"),
+                                          ("evaluate", fac.PlannerConfig, "")):
+        text = subparsers[command].format_help()
+        for f in dataclasses.fields(config_class):
+            assert f"--{prefix}{f.name}".replace("_", "-") in text
+
+
+# configuration ------------------------------------------------------------------------
+
+
+def configs_of(monkeypatch, *arguments):
+    """The configs that a command line leads to."""
+    caught = []
+    for command in ("command_distill", "command_evaluate"):
+        monkeypatch.setattr(fac, command, lambda args: caught.append(args.configs))
+    assert fac.main([str(a) for a in arguments]) == 0
+    return caught[0]
+
+
+def test_default_settings_are_those_of_the_dataclasses(monkeypatch):
+    assert configs_of(monkeypatch, "distill") == (fac.DistillConfig(), fac.PlannerConfig())
+    assert configs_of(monkeypatch, "evaluate", "--model", "x") == (fac.PlannerConfig(),)
+
+
+def test_preset_paper_is_the_paper(monkeypatch):
+    config, planner = configs_of(monkeypatch, "distill", "--preset", "paper")
+    found = dataclasses.asdict(config)
+    expected = {"steps": 100_000, "batch_size": 512, "noise_samples": 10, "horizon": 3,
+                "final_term": True, "lam": 0.5, "reward_coef": 0.5, "value_coef": 0.1,
+                "kl": "reverse", "encoder_input": "observation", "lr": 1e-4,
+                "lr_schedule": "constant", "warmup": 0, "grad_clip": 10, "sizes": "table2"}
+    assert {k: found[k] for k in expected} == expected
+    assert (planner.samples, planner.iterations, planner.elites, planner.pi_trajs,
+            planner.horizon, planner.discount) == (512, 6, 64, 24, 3, 0.99)
+
+
+def test_flags_go_before_the_preset(monkeypatch):
+    config, _ = configs_of(monkeypatch, "distill", "--preset", "paper", "--steps", 7, "--kl",
+                           "forward")
+    assert (config.steps, config.kl, config.batch_size) == (7, "forward", 512)
+
+
+def another_value(f):
+    """Flags that set a field to something else, and that value."""
+    flag = f.name.replace("_", "-")
+    if isinstance(f.default, bool):
+        return [("no-" if f.default else "") + flag], not f.default
+    if f.metadata["choices"]:
+        value = next(c for c in f.metadata["choices"] if c != f.default)
+    else:
+        value = f.default + 1 if isinstance(f.default, int) else f.default / 2
+    return [flag, str(value)], value
+
+
+@pytest.mark.parametrize("config_class, prefix, start", [
+    (fac.DistillConfig, "", ["distill"]), (fac.PlannerConfig, "plan-", ["distill"]),
+    (fac.PlannerConfig, "", ["evaluate", "--model", "x"])])
+def test_every_flag_reaches_its_setting(monkeypatch, config_class, prefix, start):
+    for f in dataclasses.fields(config_class):
+        (flag, *rest), value = another_value(f)
+        flag = f"--no-{prefix}{flag[3:]}" if flag.startswith("no-") else f"--{prefix}{flag}"
+        found = next(c for c in configs_of(monkeypatch, *start, flag, *rest)
+                     if isinstance(c, config_class))
+        assert found == dataclasses.replace(config_class(), **{f.name: value})
+        monkeypatch.undo()
+
+
+def test_interrupt_is_one_line_and_status_130(monkeypatch, capsys):
+    def interrupted(args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fac, "command_distill", interrupted)
+    assert fac.main(["distill"]) == 130
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+# bad input ----------------------------------------------------------------------------
+
+
+def refused(done, *parts):
+    """Status 2 and one line on stderr that holds `parts`; returns the line."""
+    assert done.returncode == 2, done.stderr
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1 and done.stderr.endswith("\n"), done.stderr
+    assert done.stderr.startswith("fac_tdmpc_ref.py") and ": error: " in done.stderr
+    for part in parts:
+        assert part in done.stderr
+    return done.stderr
+
+
+@pytest.mark.parametrize("flags, parts", [
+    (["--task", "reacher-hart"], ["did you mean 'reacher-hard'", *fac.TASKS]),
+    (["--task", "walker-walk"], ["expert.npz", "task", "'walker-walk'", "'reacher-hard'"]),
+    (["--num-agents", "2"], ["2 agents", "[1, 3]"]),
+    (["--num-agents", "0"], ["agents", "[1, 3]", "0"]),
+    (["--num-agents", "-3"], ["agents", "[1, 3]", "-3"]),
+    (["--steps", "0"], ["steps", "at least 1", "0"]),
+    (["--batch-size", "0"], ["batch_size", "at least 1"]),
+    (["--horizon", "0"], ["horizon", "at least 1"]),
+    (["--noise-samples", "1"], ["noise_samples", "at least 2"]),
+    (["--noise-std", "nan"], ["noise_std", "nan"]),
+    (["--lr", "0"], ["lr", "above 0"]),
+    (["--held-out", "1"], ["held_out", "between 0 and 1"]),
+    (["--held-out", "0.05"], ["replay.npz", "6 episodes are too few"]),
+    (["--kl", "sideways"], ["--kl", "'sideways'", "forward"]),
+    (["--preset", "authors"], ["--preset", "'authors'", "paper"]),
+    (["--plan-elites", "17"], ["17 elites", "16 samples"]),
+    (["--plan-horizon", "0"], ["horizon", "at least 1"]),
+    (["--plan-samples", "0"], ["samples", "at least 1"]),
+    (["--plan-pi-trajs", "-1"], ["pi_trajs", "-1"]),
+    (["--plan-min-std", "3"], ["min_std", "max_std"]),
+    (["--episodes", "0"], ["episodes", "at least 1"]),
+    (["--workers", "-1"], ["--workers", "-1"]),
+    (["--seed", "-1"], ["--seed", "-1"]),
+    (["--eval-seed", "x"], ["--eval-seed", "'x'"]),
+    (["--stepz", "3"], ["--stepz"]),
+    (["--expert", "none.npz"], ["none.npz", "no such file"]),
+    (["--replay", "none.npz"], ["none.npz", "no such file"]),
+    (["--replay", "{files}/walker.npz"], ["walker.npz", "(24, 6)", "(8, 3)"]),
+    (["--replay", "{files}/expert.npz"], ["expert.npz", "kind", "'expert'"]),
+    (["--expert", "{files}/replay.npz"], ["replay.npz", "kind", "'replay'"]),
+    (["--out", "{files}/corrupt.npz"], ["corrupt.npz", "can't be written"]),
+    (["--out", "{files}/corrupt.npz/below"], ["corrupt.npz", "can't be written"]),
+])
+def test_distill_refuses(tmp_path, files, flags, parts):
+    flags = [flag.format(files=files) for flag in flags]
+    refused(run(*distill_arguments(files, *flags), cwd=tmp_path), *parts)
+
+
+@pytest.mark.parametrize("arguments, parts", [
+    ([], ["COMMAND"]),
+    (["train"], ["'train'", "distill"]),
+    (["evaluate"], ["--model"]),
+    (["evaluate", "--model", "none.npz"], ["none.npz", "no such file"]),
+    (["evaluate", "--model", "{files}/corrupt.npz"], ["corrupt.npz", "not a readable .npz"]),
+    (["evaluate", "--model", "{files}/replay.npz"], ["replay.npz", "expert or student"]),
+    (["evaluate", "--model", "{files}/expert.npz", "--task", "reacher-heart"],
+     ["did you mean 'reacher-hard'", *fac.TASKS]),
+    (["evaluate", "--model", "{files}/expert.npz", "--task", "hopper-hop"], ["(8, 3)", "(15, 4)"]),
+    (["evaluate", "--model", "{files}/expert.npz", "--episodes", "0"], ["episodes", "at least 1"]),
+    (["evaluate", "--model", "{files}/expert.npz", "--samples", "8", "--elites", "9"],
+     ["9 elites", "8 samples"]),
+    (["evaluate", "--model", "{files}/expert.npz", "--seed", "-1"], ["--seed", "-1"]),
+    (["evaluate", "--model", "{files}/expert.npz", "--output", "best"], ["'best'", "sampled"]),
+])
+def test_other_bad_commands_are_refused(tmp_path, files, arguments, parts):
+    refused(run(*(a.format(files=files) for a in arguments), cwd=tmp_path), *parts)
+
+
+def test_a_task_without_data_says_what_to_do(tmp_path):
+    task = next((t for t in reversed(fac.TASKS) if not (fac.DATA / t / "expert.npz").exists()), None)
+    if task is None:
+        pytest.skip("there is data for every task")
+    refused(run("distill", "--task", task, cwd=tmp_path), f"train_expert.py --task {task}",
+            "--expert", "at hand for")
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_student_is_no_expert(tmp_path, files, distilled):
+    _, folder = distilled
+    done = run(*distill_arguments(files, "--expert", folder / "student.npz"), cwd=tmp_path)
+    refused(done, "student.npz", "kind", "'expert'", "'student'")
+
+
+# distill ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def distilled(tmp_path_factory, files):
+    """A whole run: (finished process, its results' folder)."""
+    cwd = tmp_path_factory.mktemp("distilled")
+    done = run(*distill_arguments(files, "--workers", "0", "--json"), cwd=cwd, env={})
+    return succeeded(done), cwd / "runs" / "reacher-hard-0"
+
+
+def test_distill_prints_json_and_a_table(distilled):
+    done, folder = distilled
+    result = last_json(done)
+    assert KEYS <= set(result)
+    assert (result["task"], result["seed"], result["steps"], result["episodes"]) == (
+        "reacher-hard", 0, STEPS, 1)
+    assert Path(result["out"]) == Path("runs/reacher-hard-0")
+    assert result["expert_recorded"] is False
+    assert result["speedup"] == result["plan_ms_expert"] / result["plan_ms_student"]
+    for who in ("expert", "student"):
+        returns = result[f"{who}_returns"]
+        assert len(returns) == 1 and 0 <= returns[0] <= 1000
+        assert result[f"{who}_return_mean"] == returns[0]
+        assert result[f"{who}_return_std"] == 0
+    assert -1 <= result["rank_correlation"] <= 1 and result["kl_reward"] > 0 < result["kl_value"]
+    table = done.stdout
+    assert "expert (measured now)" in table and "student, N = 3" in table and "±" in table
+    assert f"{result['speedup']:.1f}" in table and "speed-up" in table
+
+
+def test_distill_shows_its_progress(distilled):
+    done, _ = distilled
+    for part in ("distilling", "loss", "KL reward", "value", "step/s", "evaluating the student",
+                 "evaluating the expert"):
+        assert part in done.stderr
+    assert "Traceback" not in done.stderr and "Warning" not in done.stderr
+
+
+def test_distill_writes_its_results_and_nothing_else(distilled):
+    done, folder = distilled
+    pictures = ["curve.png"] if importlib.util.find_spec("matplotlib") else []
+    assert sorted(os.listdir(folder)) == sorted(
+        ["config.json", "curve.csv", "result.json", "student.npz", *pictures])
+    assert os.listdir(folder.parents[1]) == ["runs"]
+    assert json.loads((folder / "result.json").read_text()) == last_json(done)
+
+    model, header = fac.load_model(folder / "student.npz")
+    assert model.config.num_agents == 3 and (header["kind"], header["task"]) == (
+        "student", "reacher-hard")
+    config = json.loads((folder / "config.json").read_text())
+    assert config["distill"]["steps"] == STEPS and config["planner"]["samples"] == 16
+    assert config["num_agents"] == 3 and config["seed"] == 0
+    fac.from_dict(fac.DistillConfig, config["distill"], "config.json")
+    fac.from_dict(fac.PlannerConfig, config["planner"], "config.json")
+
+
+def test_the_curve_is_a_table_of_numbers(distilled):
+    done, folder = distilled
+    with open(folder / "curve.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == fac.CURVE
+    steps = [int(row["step"]) for row in rows]
+    assert steps == sorted(set(steps)) and len(steps) > 1 and steps[-1] == STEPS
+    assert np.isfinite([[float(v) for v in row.values()] for row in rows]).all()
+    assert abs(float(rows[-1]["kl_reward"]) - last_json(done)["kl_reward"]) < 1e-5
+
+
+def test_the_student_differs_from_its_start(distilled, files):
+    """Guards the comparisons of weights below: training did change them."""
+    weights, header = student_of(distilled[1])
+    expert, _ = fac.load_model(files / "expert.npz")
+    config = fac.from_dict(fac.DistillConfig, header["distill"], "student")
+    distiller = fac.Distiller(expert, fac.Replay(files / "replay.npz"), config)
+    try:
+        changed = {k for k, v in distiller.student.params.items() if v.tobytes() != weights[k]}
+    finally:
+        distiller.close()
+    for network in ("_encoder", "_dynamics", "_reward", "_Q1", "_Q2"):
+        assert f"{network}.0.weight" in changed
+    assert not [k for k in changed if k.startswith("_expert")]
+
+
+def test_the_same_command_gives_the_same_student(tmp_path, files, distilled, no_plots):
+    """Bit for bit, in another folder, with other numbers of processes and of BLAS threads."""
+    done = run(*distill_arguments(files, "--workers", "1", "--json", "--out", "here"),
+               cwd=tmp_path, env=no_plots)
+    first, again = last_json(distilled[0]), last_json(done)
+    assert student_of(tmp_path / "here") == student_of(distilled[1])
+    for key in ("student_returns", "expert_returns", "kl_reward", "kl_value",
+                "rank_correlation_by_step"):
+        assert again[key] == first[key]
+    assert Path(again["out"]) == Path("here")
+
+
+# going on after a crash ---------------------------------------------------------------
+
+# `distill` with a checkpoint after every second row of the curve (the clock strides), a made-up
+# evaluation, and a SIGKILL before step argv[1]: nothing gets to clean up.
+DRIVER = f"""
+import itertools, os, signal, sys, time, types
+sys.path.insert(0, {str(ROOT)!r})
+import fac_tdmpc_ref as fac
+clock = itertools.count()
+fac.time = types.SimpleNamespace(time=lambda: 13.0 * next(clock), perf_counter=time.perf_counter)
+fac.evaluate = lambda *_, **__: {{"returns": [1.0]}}
+stop, step = int(sys.argv[1]), fac.Distiller.step
+def step_or_die(self):
+    if self.t == stop:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return step(self)
+fac.Distiller.step = step_or_die
+sys.exit(fac.main(sys.argv[2:]))
+"""
+
+
+def rows_without_seconds(path):
+    with open(path, newline="") as file:
+        return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
+
+
+@pytest.fixture
+def killed(tmp_path, files, no_plots):
+    """A folder whose run was killed half way, and a function that goes on there."""
+    def distill(*more, stop=-1):
+        arguments = distill_arguments(files, "--out", tmp_path / "out", *more)
+        return launch(["-c", DRIVER, stop, *arguments], tmp_path, no_plots)
+
+    assert distill(stop=3).returncode == -signal.SIGKILL
+    assert sorted(os.listdir(tmp_path / "out")) == ["checkpoint.npz", "curve.csv"]
+    with np.load(tmp_path / "out" / "checkpoint.npz") as file:
+        assert file["step"] == 2  # so that the third step is taken twice
+    return tmp_path / "out", distill
+
+
+def test_a_killed_run_goes_on_as_if_nothing_had_been(killed, distilled):
+    out, distill = killed
+    first = distill(stop=5)  # and once more, later
+    assert first.returncode == -signal.SIGKILL
+    assert not (out / "student.npz").exists()
+    succeeded(distill())
+    assert student_of(out) == student_of(distilled[1])
+    assert rows_without_seconds(out / "curve.csv") == rows_without_seconds(
+        distilled[1] / "curve.csv")
+    assert not (out / "checkpoint.npz").exists() and (out / "result.json").exists()
+
+
+@pytest.mark.parametrize("flags, parts", [
+    (["--seed", "1"], ["seed: expected 1, found 0"]),
+    (["--num-agents", "1"], ["num_agents: expected 1, found 3"]),
+    (["--noise-std", "0.25"], ["noise_std: expected 0.25, found 0.5"]),
+    (["--expert", "{files}/other.npz"], ["(data"]),
+    (["--expert", "{files}/wider.npz"], ["(data"])])
+def test_a_checkpoint_with_other_settings_is_refused(killed, files, capfd, monkeypatch, flags,
+                                                     parts):
+    """In this process: nothing is trained or evaluated before the refusal."""
+    out, _ = killed
+    before = (out / "checkpoint.npz").read_bytes()
+    arguments = distill_arguments(files, "--out", out, *(f.format(files=files) for f in flags))
+    assert fac.main([str(a) for a in arguments]) == 2
+    message = capfd.readouterr().err.splitlines()[-1]
+    for part in ("checkpoint.npz", "other settings", "--out", *parts):
+        assert part in message
+    assert (out / "checkpoint.npz").read_bytes() == before
+
+
+# evaluate and the record of the expert ------------------------------------------------
+
+
+def test_evaluation_does_not_depend_on_the_number_of_workers(tmp_path, distilled):
+    student = distilled[1] / "student.npz"
+    found = [last_json(run("evaluate", "--model", student, "--episodes", "2", "--seed", "3",
+                           "--workers", workers, "--json", *BUDGET, cwd=tmp_path))
+             for workers in (0, 1, 2)]
+    for result in found:
+        assert {"return_mean", "return_std", "returns", "plan_ms_median", "episodes"} <= set(result)
+        assert (result["episodes"], len(result["returns"])) == (2, 2)
+        assert result["returns"] == found[0]["returns"]
+        assert result["return_mean"] == np.mean(result["returns"])
+        assert result["return_std"] == np.std(result["returns"])
+        assert result["plan_ms_median"] > 0
+    assert os.listdir(tmp_path) == []
+
+
+def test_recorded_returns_stand_for_the_expert_in_distill(tmp_path, files, no_plots, monkeypatch,
+                                                          capsys):
+    """Also: a single agent, no --json, and no matplotlib."""
+    expert = tmp_path / "expert.npz"
+    write_expert(expert)
+    done = run("evaluate", "--model", expert, "--task", "reacher-hard", "--episodes", "2",
+               "--workers", "1", "--record", "--json", *BUDGET, cwd=tmp_path)
+    measured = last_json(done)
+    model, header = fac.load_model(expert)
+    assert header["evaluation"]["returns"] == measured["returns"]
+    assert header["evaluation"]["seeds"] == fac.episode_seeds(0, 2)
+    before, _ = fac.load_model(files / "expert.npz")
+    assert all(np.array_equal(v, before.params[k]) for k, v in model.params.items())
+
+    arguments = distill_arguments(files, "--expert", expert, "--num-agents", "1", "--out", "out")
+    done = succeeded(run(*arguments, "--workers", "0", cwd=tmp_path, env=no_plots))
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert result["expert_recorded"] is True
+    assert result["expert_returns"] == measured["returns"][:1]
+    assert "expert (recorded)" in done.stdout and "student, N = 1" in done.stdout
+    assert "evaluating the expert" not in done.stderr
+    assert "pip install 'fac-tdmpc-ref[plots]'" in done.stdout
+    assert not (tmp_path / "out" / "curve.png").exists()
+    with pytest.raises(ValueError):
+        json.loads(done.stdout.splitlines()[-1])
+
+    labels = []
+
+    def evaluate(*arguments):
+        labels.append(arguments[-1])
+        return {"returns": [123.0]}
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(fac, "evaluate", evaluate)
+    monkeypatch.setattr(fac, "draw_curve", lambda *_: True)
+    assert fac.main([str(a) for a in (*arguments, "--evaluate-expert", "--json")]) == 0
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert result["expert_recorded"] is False and result["expert_returns"] == [123.0]
+    assert labels == ["evaluating the student", "evaluating the expert"]
+
+
+@pytest.mark.parametrize("config, seeds, expected", [
+    ({}, [5, 6, 7], [1.0, 2.0, 3.0]), ({}, [5, 6], [1.0, 2.0]),
+    ({}, [5, 6, 7, 8], None), ({}, [6, 5], None), ({"samples": 511}, [5], None),
+    ({"output": "mean"}, [5], None)])
+def test_a_record_counts_for_its_own_episodes_and_planner_only(config, seeds, expected):
+    header = {"evaluation": {"returns": [1.0, 2.0, 3.0], "seeds": [5, 6, 7],
+                             "planner": dataclasses.asdict(fac.PlannerConfig())}}
+    header = json.loads(json.dumps(header))
+    assert fac.recorded_returns(header, fac.PlannerConfig(**config), seeds) == expected
+    assert fac.recorded_returns({}, fac.PlannerConfig(), seeds) is None
+
+
+# the project --------------------------------------------------------------------------
+
+
+def test_continuous_integration_runs_the_readme_s_test_command():
+    commands = [line.strip() for line in (ROOT / ".ci" / "run").read_text().splitlines()
+                if "pytest" in line and not line.lstrip().startswith("#")]
+    assert len(commands) == 1
+    assert commands[0] in (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+
+
+def test_mujoco_and_dm_control_are_pinned_as_a_pair():
+    dependencies = re.search(r"^dependencies = \[(.*?)\]$", (ROOT / "pyproject.toml").read_text(),
+                             re.M | re.S).group(1)
+    names = re.findall(r'"([^"]+)"', dependencies)
+    assert "mujoco==3.17.0" in names and "dm-control==1.0.50" in names
+    assert not [name for name in names if "torch" in name or "matplotlib" in name]
