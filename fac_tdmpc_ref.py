@@ -45,7 +45,6 @@ import signal
 import sys
 import tempfile
 import time
-import zipfile
 import zlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -106,7 +105,7 @@ class PlannerConfig:
     iterations: int = field(6, "refinements of the proposal in a decision (Table 2)")
     elites: int = field(0, "sequences that refine the proposal; 0: samples / 8 (Table 2: 64)")
     pi_trajs: int = field(24, "policy proposals, where the model has a policy (Table 2)")
-    horizon: int = field(3, "H: rewards that are summed before Q (Table 2)")
+    horizon: int = field(1, "H: rewards that are summed before Q [D5]", paper=3)
     value_at: str = field("after", "where Q ends the return: after (Equation 2: H rewards, then Q "
                           "of action H + 1) or last (authors' code: Q of action H)",
                           choices=("after", "last"))
@@ -663,7 +662,8 @@ class Distiller:
     """
 
     def __init__(self, expert, replay, config, num_agents=None, seed=0):
-        sizes = expert.config
+        sizes, self.steps = expert.config, config.horizon + config.final_term
+        self.train_starts, self.held_out_starts = replay.starts(self.steps, config.held_out)
         if (replay.dim_obs, replay.dim_action) != (sizes.dim_obs, sizes.dim_action):
             raise UserError(f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, "
                             f"{replay.dim_action}), the expert expects ({sizes.dim_obs}, "
@@ -671,6 +671,7 @@ class Distiller:
         self.expert, self.config, self.seed, self.t = expert, config, seed, 0
         agents = sizes.dim_action if num_agents is None else num_agents
         self.model_config = student_config(sizes, agents, config.sizes, config.encoder_input)
+        self._threads = one_thread()  # until `close`, in this thread and the teacher's
         student = WorldModel.create(self.model_config, np.random.default_rng([seed, 2 ** 32 - 1]))
         if config.encoder_input == "latent":
             student.params.update({"_expert" + k: v for k, v in expert.params.items()
@@ -681,12 +682,9 @@ class Distiller:
         self.student = WorldModel(self.model_config, {**views, **frozen})
         self.gradient, self._grads = flatten({k: np.zeros_like(v) for k, v in trained.items()})
         self.adam = Adam(len(self.vector))
-        self.steps = config.horizon + config.final_term
         self.replay = replay
-        self.train_starts, self.held_out_starts = replay.starts(self.steps, config.held_out)
         self._teacher, self._next = ThreadPoolExecutor(1), None
         self._arenas = Arena(), Arena()  # the student's and the teacher's
-        self._threads = one_thread()  # in each of the two, until `close`
 
     def batch(self, t):
         """Line 4 and the expert's part of step t: features, perturbed actions, targets."""
@@ -1407,9 +1405,9 @@ def read_npz(path, kind):
             arrays = {key: np.asarray(file[key]) for key in file.files}
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
-    except (OSError, ValueError, EOFError, KeyError, AttributeError, TypeError, RuntimeError,
-            zlib.error, zipfile.BadZipFile) as error:
-        raise UserError(f"{path}: not a readable .npz file ({error})") from None
+    except Exception as error:  # a damaged file can raise nearly anything
+        raise UserError(f"{path}: not a readable .npz file ({' '.join(str(error).split())})"
+                        ) from None
     try:
         header = json.loads(arrays.pop("header").tobytes())
         if not isinstance(header, dict):
@@ -1656,11 +1654,13 @@ def train_student(distiller, out, settings):
     curve, before = [], 0.0
     if checkpoint.exists():
         header, arrays = read_npz(checkpoint, ("checkpoint",))
-        for key, value in json.loads(json.dumps(settings)).items():
-            if header["settings"].get(key) != value:
+        theirs, ours = ({**s, **s["distill"], "distill": None}
+                        for s in (header["settings"], settings))
+        for key, value in ours.items():
+            if theirs.get(key) != value:
                 raise UserError(f"{checkpoint}: an unfinished run with other settings ({key}: "
-                                f"expected {value}, found {header['settings'].get(key)}); finish "
-                                f"it with its own, delete it, or choose another --out")
+                                f"expected {value}, found {theirs.get(key)}); finish it with its "
+                                f"own, delete it, or choose another --out")
         curve, before = header["curve"], header["seconds"]
         distiller.load(arrays)
     began = saved = time.time()
@@ -1945,8 +1945,9 @@ def main(argv=None):
     args = make_parser().parse_args(argv)
     try:
         if args.command == "distill":
-            preset = paper_preset(DistillConfig) if args.preset == "paper" else {}
-            args.configs = from_args(DistillConfig, args, **preset), from_args(PlannerConfig, args)
+            args.configs = tuple(
+                from_args(config, args, **(paper_preset(config) if args.preset == "paper" else {}))
+                for config in (DistillConfig, PlannerConfig))
         else:
             args.configs = (from_args(PlannerConfig, args),)
         result = args.run(args)

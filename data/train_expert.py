@@ -292,7 +292,7 @@ def train(args, config, planner):
             episode = [obs], [], []
             std = float(np.interp(decisions, [0, config.std_steps],
                                   [config.std_start, planner.min_std]))
-            horizon = int(np.interp(decisions, [0, config.std_steps], [1, config.horizon]))
+            horizon = int(np.interp(decisions, [0, config.std_steps], [1, planner.horizon]))
             warming = decisions < config.seed_decisions
             mean = torch.zeros(horizon + 1, args.envs, dim_action, device=args.device)
             losses = []
@@ -489,7 +489,7 @@ def write_golden(folder, replay, config):
     found.update(obs=obs.swapaxes(1, 2), action=action.swapaxes(1, 2), rewards=reward)
 
     # one refinement of MPPI (Equation 2) with fixed noise
-    planner = fac.PlannerConfig(samples=64, elites=8, pi_trajs=0)
+    planner = fac.PlannerConfig(samples=64, elites=8, pi_trajs=0, horizon=3)
     dim_action = expert.config.dim_action
     noise = rng.standard_normal((planner.rewards + 1, dim_action, planner.samples), np.float32)
     mean = rng.uniform(-0.5, 0.5, (planner.rewards + 1, dim_action)).astype(np.float32)
@@ -607,7 +607,7 @@ def main(argv=None):
     parser.add_argument("--out", default=None, help="checkpoint directory [runs/expert-<task>]")
     parser.add_argument("--data", default=None, help="where to export [this script's folder]")
     fac.add_config(parser, fac.ExpertConfig)
-    few = {"samples": 128, "iterations": 4}
+    few = {"samples": 128, "iterations": 4, "horizon": 3}
     fac.add_config(parser, fac.PlannerConfig, "MPPI while training", "plan-", **few)
     args = parser.parse_args(argv)
     args.out = args.out or f"runs/expert-{args.task}"

@@ -61,8 +61,9 @@ def refusal(call, *parts):
 
 @pytest.fixture
 def expert_file(tmp_path):
-    fac.save_model(tmp_path / "expert.npz", make_model(policy=True), {"kind": "expert", "task": "t"})
-    return tmp_path / "expert.npz"
+    path = tmp_path / "expert.npz"
+    fac.save_model(path, make_model(policy=True), {"kind": "expert", "task": "t"})
+    return path
 
 
 def replay_arrays(episodes=6, rows=30, dim_obs=8, dim_action=3):
@@ -173,6 +174,22 @@ def test_damage_anywhere_is_refused_in_one_line(tmp_path, expert_file):
                 assert str(damaged) in str(error) and "\n" not in str(error)
                 refused += 1
     assert refused > 150
+
+
+@pytest.mark.parametrize("old, new", [
+    (b"(9, 7)", b"(9, 7 "),             # Python's tokenizer gives up
+    (b"(9, 7)", b"(9, -)"), (b"'<f4'", b"'<q4'"),
+    (b"\x93NUMPY\x01\x00v\x00", b"\x93NUMPY\x01\x00\xff\xff")])  # NumPy's answer has two lines
+def test_damaged_description_of_an_array(tmp_path, expert_file, old, new):
+    path = tmp_path / "damaged.npz"
+    with zipfile.ZipFile(expert_file) as source, zipfile.ZipFile(path, "w") as target:
+        for name in source.namelist():
+            data = source.read(name)
+            if name == "_encoder.0.weight.npy":
+                assert old in data
+                data = data.replace(old, new, 1) + bytes(70_000)
+            target.writestr(name, data)
+    refusal(lambda: fac.load_model(path), path, "not a readable .npz file")
 
 
 def test_pickles_are_refused(tmp_path, expert_file):
