@@ -145,10 +145,15 @@ class DistillConfig:
     steps: int = field(12_000, "gradient steps [D1]", paper=100_000)
     batch_size: int = field(16, "B: states in a step [D1]", paper=512)
     noise_samples: int = field(10, "K: perturbations of each action (section 4.4)")
-    noise_std: float = field(0.5, "deviation of the perturbations (authors' code)")
-    horizon: int = field(3, "H: steps of the latent rollout (Table 2)")
+    noise_std: float = field(2.0, "largest deviation of the perturbations [D8]", paper=0.5)
+    noise_std_min: float = field(0.2, "smallest; each state's is drawn between, evenly in the "
+                                 "logarithm [D8]", paper=0.5)
+    clip_actions: bool = field(True, "clip perturbed actions to [-1, 1], where planning looks [D8]",
+                               paper=False)
+    horizon: int = field(1, "H: steps of the latent rollout, as far as planning looks [D5]",
+                         paper=3)
     final_term: bool = field(True, "sum over h = 0..H as printed; off: 0..H-1 as the authors' code")
-    lam: float = field(0.5, "lambda: weight of step h is lambda^h (rho in Table 2)")
+    lam: float = field(1.0, "lambda: weight of step h is lambda^h (rho in Table 2) [D5]", paper=0.5)
     reward_coef: float = field(0.5, "weight of the rewards' divergence (Table 2)")
     value_coef: float = field(0.1, "weight of each Q's divergence (Table 2)")
     temperature_student: float = field(0.5, "T_s of Equation 4 (authors' code)")
@@ -166,6 +171,8 @@ class DistillConfig:
     grad_clip: float = field(10.0, "largest gradient norm (Table 2)")
     sizes: str = field("table2", "agent sizes: table2 (m = 50) or section51 (m = 512 // N)",
                        choices=("table2", "section51"))
+    hindsight: float = field(0.5, "reacher only: share of states whose target is moved to where "
+                             "the finger is later in the episode [D7]", paper=0.0)
     held_out: float = field(0.05, "share of episodes kept for the rank correlation")
 
     def __post_init__(self):
@@ -176,9 +183,13 @@ class DistillConfig:
         if self.noise_samples < 2:
             raise UserError(f"distillation: noise_samples must be at least 2 to be ranked, not "
                             f"{self.noise_samples}")
-        for name in ("noise_std", "temperature_student", "temperature_expert", "lr", "grad_clip"):
+        for name in ("noise_std_min", "temperature_student", "temperature_expert", "lr",
+                     "grad_clip"):
             if not getattr(self, name) > 0:
                 raise UserError(f"distillation: {name} must be above 0, not {getattr(self, name)}")
+        if self.noise_std < self.noise_std_min:
+            raise UserError(f"distillation: noise_std must be at least noise_std_min "
+                            f"({self.noise_std_min}), not {self.noise_std}")
         if not 0 < self.held_out < 1:
             raise UserError(f"distillation: held_out must lie between 0 and 1, not {self.held_out}")
         check_choices(self)
@@ -690,9 +701,14 @@ class Distiller:
         """Line 4 and the expert's part of step t: features, perturbed actions, targets."""
         rng = np.random.default_rng([self.seed, t])
         starts = rng.choice(self.train_starts, self.config.batch_size)
+        obs, actions = self.replay.sequences(starts, self.steps)
+        task = self.replay.header.get("task", "")
+        if task.startswith("reacher"):
+            later, _ = self.replay.sequences(self.replay.later(starts, rng), 1)
+            chosen = rng.random(len(starts)) < self.config.hindsight
+            hindsight(obs.T[None], np.empty((0, len(starts))), later.T, chosen, task)
         self._arenas[1].rewind()
-        return perturbed_batch(self.expert, self.student, self.replay, starts, self.steps,
-                               self.config.noise_samples, self.config.noise_std, rng,
+        return perturbed_batch(self.expert, self.student, obs, actions, self.config, rng,
                                self._arenas[1].empty)
 
     def learning_rate(self, t):
@@ -733,34 +749,38 @@ class Distiller:
         self._threads.restore_original_limits()
 
 
-def perturbed_batch(expert, student, replay, starts, steps, noise_samples, noise_std, rng,
-                    empty=np.empty):
-    """Features (1, F, B), perturbed actions (L, A, B, K) and expert predictions for `starts`."""
-    obs, actions = replay.sequences(starts, steps)
-    noise = rng.standard_normal((*actions.shape, noise_samples), F32)
-    noise *= noise_std
+def perturbed_batch(expert, student, obs, actions, config, rng, empty=np.empty):
+    """Features (1, F, B), perturbed actions (L, A, B, K) and the expert's predictions for them.
+
+    obs (O, B) and actions (L, A, B) come from the replay; a_h + eps_h, eps ~ N(0, Sigma) with
+    one deviation for each state.
+    """
+    noise = rng.standard_normal((*actions.shape, config.noise_samples), F32)
+    span = np.log([config.noise_std_min, config.noise_std])
+    noise *= np.exp(rng.uniform(*span, actions.shape[-1])).astype(F32)[:, None]
     noise += actions[..., None]
+    if config.clip_actions:
+        np.clip(noise, -1, 1, out=noise)
     z = expert.encode(obs)
-    features = z.reshape(1, -1, z.shape[-1])
-    if not student.config.expert_latent_dim:
-        features = obs[None]
+    features = z.reshape(1, -1, z.shape[-1]) if student.config.expert_latent_dim else obs[None]
     return features, noise, predict(expert, z, noise, empty=empty)
 
 
-def rank_correlation(student, expert, replay, starts, steps, noise_std, seed, states=128, noise=32):
+def rank_correlation(distiller, states, seed):
     """Spearman's correlation of the global Q (mean of both) over perturbed actions, at each h.
 
-    Mean over `states` states drawn from `starts`; 1 means that the student orders actions as
-    the expert does, which is what the loss asks for (section 4.4). Returns (L,).
+    Mean over `states` held-out states with 32 actions each; 1 means that the student orders
+    actions as the expert does, which is what the loss asks for (section 4.4). Returns (L,).
     """
     from scipy.stats import rankdata
     rng = np.random.default_rng(seed)
-    starts = rng.choice(starts, states)
-    features, actions, (_, *q_expert) = perturbed_batch(expert, student, replay, starts, steps,
-                                                        noise, noise_std, rng)
+    starts = rng.choice(distiller.held_out_starts, states)
+    student, config = distiller.student, dataclasses.replace(distiller.config, noise_samples=32)
+    sequences = distiller.replay.sequences(starts, distiller.steps)
+    features, actions, (_, *q_expert) = perturbed_batch(distiller.expert, student, *sequences,
+                                                        config, rng)
     _, *q_student = predict(student, student.encode_features(features), actions)
-    ranks = [rankdata(q1 + q2, axis=-1) - (noise + 1) / 2
-             for q1, q2 in (q_expert, q_student)]
+    ranks = [rankdata(q1 + q2, axis=-1) - 16.5 for q1, q2 in (q_expert, q_student)]
     norms = [np.linalg.norm(r, axis=-1) for r in ranks]
     return ((ranks[0] * ranks[1]).sum(-1) / np.maximum(norms[0] * norms[1], 1e-12)).mean(-1)
 
@@ -1511,6 +1531,10 @@ class Replay:
                             f"share of {held_out} and sample {steps} steps; collect more")
         return np.concatenate(kept), np.concatenate(held)
 
+    def later(self, rows, rng):
+        """A random later row of the same episode for each row (not an episode's last)."""
+        return rng.integers(rows + 1, self.ends[np.searchsorted(self.ends, rows)] + 1)
+
     def sequences(self, starts, steps):
         """First observations (O, B) and actions (L, A, B), float32, of the rows in `starts`."""
         obs = self.observation[starts].T.astype(F32)
@@ -1674,9 +1698,7 @@ def train_student(distiller, out, settings):
             if distiller.t % every == 0 or distiller.t == config.steps:
                 loss, kl_reward, kl_value = np.mean(losses, 0)
                 losses, seconds = [], before + time.time() - began
-                rank = rank_correlation(distiller.student, distiller.expert, distiller.replay,
-                                        distiller.held_out_starts, distiller.steps,
-                                        config.noise_std, distiller.seed, states=64)
+                rank = rank_correlation(distiller, 64, distiller.seed)
                 curve.append([distiller.t, round(seconds, 2), float(loss), float(kl_reward),
                               float(kl_value), rate, float(rank[0]),
                               float(rank[min(1, len(rank) - 1)]), float(rank[-1])])
@@ -1765,8 +1787,7 @@ def command_distill(args):
           f"results in {out}", file=sys.stderr)
     with contextlib.closing(distiller):
         curve, seconds = train_student(distiller, out, settings)
-        rank = rank_correlation(distiller.student, expert, replay, distiller.held_out_starts,
-                                distiller.steps, config.noise_std, args.seed, states=256)
+        rank = rank_correlation(distiller, 256, args.seed)
     student = distiller.student
     save_model(out / "student.npz", student, {"kind": "student", **settings})
     with atomic_file(out / "config.json", "w") as file:

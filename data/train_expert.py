@@ -229,7 +229,7 @@ class Replay:
             self.count += 1
 
     def sample(self, rng, batch, horizon, task):
-        """Time-major segments; for reacher half of them with a hindsight target."""
+        """Time-major segments, drawn evenly; for reacher half with a hindsight target [D6]."""
         episode = rng.integers(min(self.count, len(self.obs)), size=batch)
         start = rng.integers(fac.EPISODE_STEPS - horizon + 1, size=batch)
         steps = start + np.arange(horizon + 1)[:, None]

@@ -267,7 +267,7 @@ def import_train_expert():
 
 def test_configs_refuse_nonsense():
     for wrong in ({"kl": "sideways"}, {"steps": 0}, {"noise_samples": 1}, {"lr": 0.0},
-                  {"temperature_expert": -1.0}, {"held_out": 1.0}):
+                  {"temperature_expert": -1.0}, {"held_out": 1.0}, {"noise_std": 0.1}):
         with pytest.raises(fac.UserError, match=next(iter(wrong))):
             fac.DistillConfig(**wrong)
     for f in dataclasses.fields(fac.DistillConfig):
