@@ -105,7 +105,8 @@ class PlannerConfig:
     iterations: int = field(6, "refinements of the proposal in a decision (Table 2)")
     elites: int = field(0, "sequences that refine the proposal; 0: samples / 8 (Table 2: 64)")
     pi_trajs: int = field(24, "policy proposals, where the model has a policy (Table 2)")
-    horizon: int = field(1, "H: rewards that are summed before Q [D5]", paper=3)
+    horizon: int = field(1, "H: rewards that are summed before Q (H - 1 with value_at last) [D5]",
+                         paper=3)
     value_at: str = field("after", "where Q ends the return: after (Equation 2: H rewards, then Q "
                           "of action H + 1) or last (authors' code: Q of action H)",
                           choices=("after", "last"))
@@ -115,14 +116,14 @@ class PlannerConfig:
     temperature: float = field(0.5, "an elite weighs exp(temperature * return) (Table 2)")
     momentum: float = field(0.1, "share of the old mean that is kept (TD-MPC's code)")
     output: str = field("sampled", "the action: sampled from the elites by weight (TD-MPC's code) "
-                        "or their weighted mean (the paper's text)", choices=("sampled", "mean"))
+                        "or the proposal's mean (the paper's text)", choices=("sampled", "mean"))
 
     def __post_init__(self):
         if self.elites == 0:
             object.__setattr__(self, "elites", max(1, self.samples // 8))
         for name, least in (("samples", 1), ("iterations", 1), ("elites", 1), ("horizon", 1),
                             ("pi_trajs", 0), ("temperature", 0), ("discount", 0), ("momentum", 0)):
-            if not getattr(self, name) >= least:  # not >=, so that nan is refused
+            if not getattr(self, name) >= least:  # nan is not, either
                 raise UserError(f"planner: {name} must be at least {least}, not "
                                 f"{getattr(self, name)}")
         if self.elites > self.samples:
@@ -171,27 +172,28 @@ class DistillConfig:
     grad_clip: float = field(10.0, "largest gradient norm (Table 2)")
     sizes: str = field("table2", "agent sizes: table2 (m = 50) or section51 (m = 512 // N)",
                        choices=("table2", "section51"))
-    hindsight: float = field(0.5, "reacher only: share of states whose target is moved to where "
-                             "the finger is later in the episode [D7]", paper=0.0)
+    new_targets: float = field(0.5, "reacher only: share of states whose target is drawn anew, as "
+                               "the task draws it [D7]", paper=0.0)
     held_out: float = field(0.05, "share of episodes kept for the rank correlation")
 
     def __post_init__(self):
-        for name in ("steps", "batch_size", "horizon"):
-            if getattr(self, name) < 1:
-                raise UserError(f"distillation: {name} must be at least 1, not "
+        for name, least in (("steps", 1), ("batch_size", 1), ("horizon", 1), ("noise_samples", 2),
+                            ("lam", 0), ("reward_coef", 0), ("value_coef", 0), ("warmup", 0)):
+            if not getattr(self, name) >= least:
+                raise UserError(f"distillation: {name} must be at least {least}, not "
                                 f"{getattr(self, name)}")
-        if self.noise_samples < 2:
-            raise UserError(f"distillation: noise_samples must be at least 2 to be ranked, not "
-                            f"{self.noise_samples}")
         for name in ("noise_std_min", "temperature_student", "temperature_expert", "lr",
                      "grad_clip"):
             if not getattr(self, name) > 0:
                 raise UserError(f"distillation: {name} must be above 0, not {getattr(self, name)}")
-        if self.noise_std < self.noise_std_min:
+        if not self.noise_std >= self.noise_std_min:
             raise UserError(f"distillation: noise_std must be at least noise_std_min "
                             f"({self.noise_std_min}), not {self.noise_std}")
-        if not 0 < self.held_out < 1:
-            raise UserError(f"distillation: held_out must lie between 0 and 1, not {self.held_out}")
+        if not 0 <= self.new_targets <= 1:
+            raise UserError(f"distillation: new_targets is a share, not {self.new_targets}")
+        if not 0 < self.held_out <= 0.5:
+            raise UserError(f"distillation: held_out must lie between 0 and 0.5, not "
+                            f"{self.held_out}")
         check_choices(self)
 
 
@@ -357,7 +359,7 @@ def norm(x, g, b, empty=np.empty):
 
 
 def norm_backward(dy, x, g, empty=np.empty):
-    """Gradients of y = g x_hat + b; dx leaves out what moves the mean or the variance."""
+    """Gradients of y = g x_hat + b; x_hat has no part that shifts or scales all features."""
     x_hat, scale = standardize(x, empty)
     db = dy.sum(2, keepdims=True)
     dg = np.einsum("nfb,nfb->nf", dy, x_hat)[:, :, None]
@@ -622,10 +624,10 @@ def log_softmax(x):
 
 
 def soft_kl(student, expert, temperature_student, temperature_expert, kind="forward"):
-    """Equation 4: KL between softmax(expert / T_e) and softmax(student / T_s) over the last axis.
+    """D(p_e || p_s) of p_e = softmax(expert / T_e) and p_s = softmax(student / T_s), Equation 4.
 
-    student, expert (..., K) predictions for the K perturbed actions of a state. Returns the
-    divergence (...) and its gradient with respect to `student` (..., K).
+    student, expert (..., K): predictions for the K perturbed actions of a state. "reverse" is
+    D(p_s || p_e) [D2]. Returns the divergence (...) and its gradient by `student` (..., K).
     """
     log_s = log_softmax(student / temperature_student)
     log_e = log_softmax(expert / temperature_expert)
@@ -641,8 +643,10 @@ def soft_kl(student, expert, temperature_student, temperature_expert, kind="forw
 def distill_loss(student, features, actions, targets, config, grads=None, empty=np.empty):
     """The loss in line 6 of Algorithm 1 and, into the dict `grads`, its gradients.
 
+        mean over B of sum_h lambda^h [c_R D(R_h) + c_Q (D(Q1_h) + D(Q2_h))]
+
     features (1, F, B): what the student's encoder reads in the first states; actions
-    (L, A, B, K): a_h + eps_h; targets: the expert's `predict` for them. Returns the loss and
+    (L, A, B, K): perturbed; targets: the expert's `predict` for them. Returns the loss and
     the mean divergences of reward and value over steps and states.
     """
     tapes, encoder_tape = {}, []
@@ -703,10 +707,9 @@ class Distiller:
         starts = rng.choice(self.train_starts, self.config.batch_size)
         obs, actions = self.replay.sequences(starts, self.steps)
         task = self.replay.header.get("task", "")
-        if task.startswith("reacher"):
-            later, _ = self.replay.sequences(self.replay.later(starts, rng), 1)
-            chosen = rng.random(len(starts)) < self.config.hindsight
-            hindsight(obs.T[None], np.empty((0, len(starts))), later.T, chosen, task)
+        if task.startswith("reacher"):  # [D7]
+            chosen = rng.random(len(starts)) < self.config.new_targets
+            obs[3:5, chosen] = new_targets(obs[:, chosen], rng)
         self._arenas[1].rewind()
         return perturbed_batch(self.expert, self.student, obs, actions, self.config, rng,
                                self._arenas[1].empty)
@@ -752,8 +755,8 @@ class Distiller:
 def perturbed_batch(expert, student, obs, actions, config, rng, empty=np.empty):
     """Features (1, F, B), perturbed actions (L, A, B, K) and the expert's predictions for them.
 
-    obs (O, B) and actions (L, A, B) come from the replay; a_h + eps_h, eps ~ N(0, Sigma) with
-    one deviation for each state.
+    obs (O, B) and actions (L, A, B) come from the replay. Each state has a deviation of its own
+    for eps_h, and a_h + eps_h is clipped [D8].
     """
     noise = rng.standard_normal((*actions.shape, config.noise_samples), F32)
     span = np.log([config.noise_std_min, config.noise_std])
@@ -1054,6 +1057,8 @@ class Planner:
         if obs.shape != (self.model.config.dim_obs,):
             raise UserError(f"observation: expected shape ({self.model.config.dim_obs},), "
                             f"found {obs.shape}")
+        if not np.isfinite(obs).all():
+            raise UserError("observation: holds values that are not finite")
         with one_thread():
             z = self.model.encode(obs[:, None])
             if not self._workers:
@@ -1224,6 +1229,7 @@ EPISODE_STEPS = 500  # decisions in an episode: 1000 control steps of dm_control
 ACTION_REPEAT = 2  # control steps a decision; their rewards are added
 REACHER_TARGET = {"easy": 0.05, "hard": 0.015}  # radius of the target, metres
 FINGER_RADIUS = 0.01
+REACHER_LINK = 0.09
 
 # dm_control's reacher has two links; the paper's has three. Three links of 9 cm, the two
 # inner joints stop at 80 degrees, nothing collides, the task is the two-link one's.
@@ -1243,14 +1249,14 @@ REACHER_XML = f"""
     <geom name="target" type="sphere" pos="0 0 0.01" size="0.05" rgba="0.8 0.2 0.2 1"/>
     <body name="arm0" pos="0 0 0.01">
       <joint name="joint0"/>
-      <geom name="arm0" class="link" fromto="0 0 0 0.09 0 0"/>
-      <body name="arm1" pos="0.09 0 0">
+      <geom name="arm0" class="link" fromto="0 0 0 {REACHER_LINK} 0 0"/>
+      <body name="arm1" pos="{REACHER_LINK} 0 0">
         <joint name="joint1" limited="true" range="-80 80"/>
-        <geom name="arm1" class="link" fromto="0 0 0 0.09 0 0"/>
-        <body name="hand" pos="0.09 0 0">
+        <geom name="arm1" class="link" fromto="0 0 0 {REACHER_LINK} 0 0"/>
+        <body name="hand" pos="{REACHER_LINK} 0 0">
           <joint name="joint2" limited="true" range="-80 80"/>
           <geom name="hand" class="link" fromto="0 0 0 0.1 0 0"/>
-          <body name="finger" pos="0.09 0 0">
+          <body name="finger" pos="{REACHER_LINK} 0 0">
             <geom name="finger" type="sphere" size="{FINGER_RADIUS}" rgba="0.9 0.6 0.2 1"/>
           </body>
         </body>
@@ -1341,6 +1347,14 @@ def hindsight(obs, reward, later, chosen, task):
     obs[:, chosen, 3:5] -= later[chosen, 3:5]
     distance = np.linalg.norm(obs[1:, chosen, 3:5], axis=-1)
     reward[:, chosen] = ACTION_REPEAT * (distance <= radius)
+
+
+def new_targets(obs, rng):
+    """Finger-to-target (2, B) of reacher states (8, B) for targets drawn as the task draws them."""
+    heading = np.cumsum(obs[:3], 0)
+    finger = REACHER_LINK * np.stack([np.cos(heading).sum(0), np.sin(heading).sum(0)])
+    angle, radius = rng.uniform(0, 2 * np.pi, obs.shape[1]), rng.uniform(0.05, 0.2, obs.shape[1])
+    return radius * np.stack([np.cos(angle), np.sin(angle)]) - finger
 
 
 def _environment_worker(connection):
@@ -1531,10 +1545,6 @@ class Replay:
                             f"share of {held_out} and sample {steps} steps; collect more")
         return np.concatenate(kept), np.concatenate(held)
 
-    def later(self, rows, rng):
-        """A random later row of the same episode for each row (not an episode's last)."""
-        return rng.integers(rows + 1, self.ends[np.searchsorted(self.ends, rows)] + 1)
-
     def sequences(self, starts, steps):
         """First observations (O, B) and actions (L, A, B), float32, of the rows in `starts`."""
         obs = self.observation[starts].T.astype(F32)
@@ -1665,7 +1675,7 @@ def progress(label, total, unit, initial=0):
 
 
 CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correlation_h0",
-         "rank_correlation_h1", "rank_correlation_last")
+         "rank_correlation_last")
 
 
 def train_student(distiller, out, settings):
@@ -1700,8 +1710,7 @@ def train_student(distiller, out, settings):
                 losses, seconds = [], before + time.time() - began
                 rank = rank_correlation(distiller, 64, distiller.seed)
                 curve.append([distiller.t, round(seconds, 2), float(loss), float(kl_reward),
-                              float(kl_value), rate, float(rank[0]),
-                              float(rank[min(1, len(rank) - 1)]), float(rank[-1])])
+                              float(kl_value), rate, float(rank[0]), float(rank[-1])])
                 bar.set_postfix_str(f"loss {loss:.4f} KL reward {kl_reward:.4f} value "
                                     f"{kl_value:.4f} rank {rank[0]:.3f}", False)
                 write_curve(out / "curve.csv", curve)
@@ -1733,8 +1742,7 @@ def draw_curve(path, curve, title):
     for key, label in (("kl_reward", "rewards"), ("kl_value", "values")):
         left.semilogy(columns["step"], columns[key], label=label)
     left.set(xlabel="gradient step", ylabel="KL divergence", title=title)
-    for key, label in (("rank_correlation_h0", "h = 0"), ("rank_correlation_h1", "h = 1"),
-                       ("rank_correlation_last", "last step")):
+    for key, label in (("rank_correlation_h0", "h = 0"), ("rank_correlation_last", "last h")):
         right.plot(columns["step"], columns[key], label=label)
     right.set(xlabel="gradient step", ylabel="rank correlation of Q",
               title="held-out states", ylim=(None, 1))
@@ -1829,7 +1837,7 @@ def command_distill(args):
           f"{planning.horizon}\n")
     print_table([
         ("", "return", "ms a decision", "speed-up"),
-        (f"expert ({'recorded' if recorded else 'measured now'})",
+        (f"expert ({'recorded' if recorded else 'measured now'}), one process",
          f"{np.mean(returns):.0f} ± {np.std(returns):.0f}", f"{ms[0]:.1f}", "1.0"),
         (f"student, N = {num_agents}, one process",
          f"{result['student_return_mean']:.0f} ± {result['student_return_std']:.0f}",
@@ -1856,6 +1864,9 @@ def command_evaluate(args):
     (planning,) = args.configs
     model, header = load_model(args.model)
     task = args.task or header.get("task")
+    if args.record and task != header.get("task"):
+        raise UserError(f"{args.model}: header: task: expected {task!r} to record its returns, "
+                        f"found {header.get('task')!r}")
     found = evaluate(model, task, planning, args.episodes, args.seed, args.workers)
     returns = found["returns"]
     result = {"return_mean": float(np.mean(returns)), "return_std": float(np.std(returns)),
@@ -1976,8 +1987,9 @@ def main(argv=None):
         print(f"fac_tdmpc_ref.py: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("fac_tdmpc_ref.py: interrupted; the same command goes on where it was cut off",
-              file=sys.stderr)
+        print("fac_tdmpc_ref.py: interrupted" + (
+            "; the same command goes on from its last checkpoint" * (args.command == "distill")),
+            file=sys.stderr)
         return 130
     if args.json:
         print(json.dumps(result))

@@ -10,7 +10,7 @@ Several environments step in worker processes and are planned for as one batch.
 
 It stops cleanly after --minutes, and goes on from its last checkpoint (written after every
 round of episodes) when started again with the same --out. When all decisions are made it
-writes expert.npz, replay.npz and golden.npz into data/<task>/.
+writes expert.npz, replay.npz and golden.npz into data/<task>/, and data/golden-narrow.npz.
 """
 import argparse
 import csv
@@ -324,6 +324,8 @@ def train(args, config, planner):
             if warming and decisions >= config.seed_decisions:  # catch up on the random episodes
                 for _ in tqdm(range(int(config.updates_per_step * decisions)), desc="first updates",
                               leave=False):
+                    if args.minutes and time.time() - began > 60 * args.minutes:
+                        break
                     batch = replay.sample(rng, config.batch_size, config.horizon, args.task)
                     losses.append([x.detach() for x in
                                    learner.update(*map(to_device, batch), std)])
@@ -352,6 +354,11 @@ def train(args, config, planner):
 
 
 # -------------------------------------------------------------------------------- export
+
+# golden files keep to the paper here, whatever the defaults are
+AS_PRINTED = {"horizon": 3, "lam": 0.5, "noise_std": 0.5, "noise_std_min": 0.5,
+              "clip_actions": False}
+
 
 def export(args, config, planner, learner, replay, decisions, minutes):
     """Write data/<task>/expert.npz, replay.npz and golden.npz, and data/golden-narrow.npz."""
@@ -510,7 +517,7 @@ def write_golden(folder, replay, config):
                  mppi_std=std.clamp(planner.min_std, planner.max_std).numpy())
 
     # Equation 4 for a fresh student of the default preset, N = dim(A)
-    distill = fac.DistillConfig(batch_size=8)
+    distill = fac.DistillConfig(batch_size=8, **AS_PRINTED)
     sizes = fac.student_config(expert.config, dim_action, distill.sizes, distill.encoder_input)
     params = alive_student(sizes, rng, torch.float64)
     found.update({f"student {k}": v.detach().numpy().astype(np.float32) for k, v in params.items()
@@ -563,8 +570,8 @@ def write_narrow_golden(path):
     for n in (1, 2, 3, 6):
         for kind in ("forward", "reverse"):
             tag = f"{n} {kind}"
-            distill = fac.DistillConfig(kl=kind, noise_samples=4, grad_clip=0.05, horizon=2,
-                                        temperature_student=0.7)
+            distill = fac.DistillConfig(kl=kind, noise_samples=4, grad_clip=0.05,
+                                        temperature_student=0.7, **{**AS_PRINTED, "horizon": 2})
             sizes = fac.ModelConfig(7, 6, n, 4, 16, 24)
             params = alive_student(sizes, rng, torch.float64)
             features = rng.standard_normal((1, 7, 5)).astype(np.float32)
@@ -592,13 +599,12 @@ def write_narrow_golden(path):
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0],
-                                     formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--task", default="reacher-hard")
     parser.add_argument("--decisions", type=int, default=100_000,
-                        help="decisions in all (two environment steps each)")
+                        help="decisions in all, two environment steps each [100000]")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--envs", type=int, default=8, help="environments stepped side by side")
+    parser.add_argument("--envs", type=int, default=8, help="environments stepped side by side [8]")
     parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 1) // 2),
                         help="processes that step them; 0 for none")
     parser.add_argument("--threads", type=int, default=0, help="PyTorch threads; 0: its default")
@@ -615,7 +621,11 @@ def main(argv=None):
         config = fac.from_args(fac.ExpertConfig, args)
         planner = fac.from_args(fac.PlannerConfig, args, **few)
         learner, replay, decisions, minutes, done = train(args, config, planner)
-        if done:
+        if not done:
+            print(f"stopped after {decisions} decisions; the same command goes on from "
+                  f"{args.out}/checkpoint.pt (a round of episodes that was under way is lost)",
+                  file=sys.stderr)
+        else:
             export(args, config, planner, learner, replay, decisions, round(minutes, 1))
     except fac.UserError as error:
         print(f"train_expert.py: error: {error}", file=sys.stderr)

@@ -253,7 +253,7 @@ def refused(done, *parts):
     (["--noise-samples", "1"], ["noise_samples", "at least 2"]),
     (["--noise-std", "nan"], ["noise_std", "nan"]),
     (["--lr", "0"], ["lr", "above 0"]),
-    (["--held-out", "1"], ["held_out", "between 0 and 1"]),
+    (["--held-out", "1"], ["held_out", "between 0 and 0.5"]),
     (["--held-out", "0.05"], ["replay.npz", "6 episodes are too few"]),
     (["--kl", "sideways"], ["--kl", "'sideways'", "forward"]),
     (["--preset", "authors"], ["--preset", "'authors'", "paper"]),
