@@ -143,7 +143,7 @@ class PlannerConfig:
 @dataclass(frozen=True)
 class DistillConfig:
     """Algorithm 1. `--preset paper` takes each field's paper value."""
-    steps: int = field(12_000, "gradient steps [D1]", paper=100_000)
+    steps: int = field(20_000, "gradient steps [D1]", paper=100_000)
     batch_size: int = field(16, "B: states in a step [D1]", paper=512)
     noise_samples: int = field(10, "K: perturbations of each action (section 4.4)")
     noise_std: float = field(2.0, "largest deviation of the perturbations [D8]", paper=0.5)
