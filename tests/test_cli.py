@@ -137,7 +137,7 @@ except SystemExit as end:
 @pytest.mark.parametrize("command, expected", [
     ((), ["distill", "evaluate"]),
     (("distill",), ["--task", "--preset", "--num-agents", "--evaluate-expert", "--plan-samples",
-                    "[12000; paper: 100000]", "[forward; paper: reverse]", "reacher-hard"]),
+                    "[20000; paper: 100000]", "[forward; paper: reverse]", "reacher-hard"]),
     (("evaluate",), ["--model", "--record", "--samples", "--output", "[6]"])])
 def test_help_is_quick_and_starts_nothing(tmp_path, command, expected):
     done = succeeded(launch(["-c", WATCHED, *command, "--help"], tmp_path))
@@ -466,7 +466,7 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(killed, distilled):
 @pytest.mark.parametrize("flags, parts", [
     (["--seed", "1"], ["seed: expected 1, found 0"]),
     (["--num-agents", "1"], ["num_agents: expected 1, found 3"]),
-    (["--noise-std", "0.25"], ["noise_std: expected 0.25, found 0.5"]),
+    (["--noise-std", "0.25"], ["noise_std: expected 0.25, found 2.0"]),
     (["--expert", "{files}/other.npz"], ["(data"]),
     (["--expert", "{files}/wider.npz"], ["(data"])])
 def test_a_checkpoint_with_other_settings_is_refused(killed, files, capsys, flags, parts):

@@ -212,7 +212,8 @@ def test_a_dead_worker_is_reported_and_nothing_hangs():
 
 
 SCRIPT = """
-import sys, time
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell has it ignored
 sys.path.insert(0, {root!r})
 import numpy as np
 import fac_tdmpc_ref as fac
