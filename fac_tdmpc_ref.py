@@ -3,9 +3,10 @@
 A TD-MPC expert (encoder, dynamics, reward, value; planning by MPPI in latent space) is distilled
 into a student whose latent state, dynamics, reward and value fall apart into one small model for
 each action dimension. Each joint then plans alone: cheaper, and in parallel. What that keeps of
-the return is measured, in the README. This file holds the method whole: networks with hand-written gradients, Adam, Algorithm 1
-(Equation 4), MPPI (Equations 2 and 3), planning workers, environments, and the command line.
-PyTorch is needed only to train new experts (data/train_expert.py).
+the return is measured, in the README. This file holds the method whole: networks with
+hand-written gradients, Adam, Algorithm 1 (Equation 4), MPPI (Equations 2 and 3), planning
+workers, environments, and the command line. PyTorch is needed only to train new experts
+(data/train_expert.py).
 
     python fac_tdmpc_ref.py distill --task reacher-hard
     python fac_tdmpc_ref.py evaluate --task reacher-hard --model runs/reacher-hard-0/student.npz
