@@ -316,7 +316,7 @@ def linear_backward(dy, x, W, empty=np.empty):
 
 
 def _zeros_row(x):
-    return np.zeros(x.shape[-1], x.dtype)  # minimum(x, row of zeros) is 4 times minimum(x, 0)
+    return np.zeros(x.shape[-1], x.dtype)  # minimum with a row is 4 times as fast as with 0
 
 
 def elu(x, empty=np.empty):

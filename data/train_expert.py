@@ -242,12 +242,6 @@ class Replay:
         return obs, action, reward
 
 
-def atomic_save(state, path):
-    temporary = path.with_suffix(".tmp")
-    torch.save(state, temporary)
-    os.replace(temporary, path)
-
-
 def train(args, config, planner):
     """Train until args.decisions or args.minutes.
 
@@ -284,6 +278,14 @@ def train(args, config, planner):
     def to_device(x):
         return torch.as_tensor(np.ascontiguousarray(x), device=args.device)
 
+    def learn(std):
+        """One update on a fresh batch; returns its three loss terms."""
+        batch = replay.sample(rng, config.batch_size, config.horizon, args.task)
+        return [x.detach() for x in learner.update(*map(to_device, batch), std)]
+
+    def out_of_time():
+        return args.minutes and time.time() - began > 60 * args.minutes
+
     done = False
     with fac.EnvironmentPool(args.task, args.envs, args.workers) as pool, \
             tqdm(total=args.decisions, initial=decisions, unit="decision", smoothing=0.05) as bar:
@@ -308,12 +310,9 @@ def train(args, config, planner):
                     history.append(item)
                 quota = config.updates_per_step * args.envs
                 updates = 0 if warming else int((step + 1) * quota) - int(step * quota)
-                for _ in range(updates):
-                    batch = replay.sample(rng, config.batch_size, config.horizon, args.task)
-                    losses.append([x.detach() for x in
-                                   learner.update(*map(to_device, batch), std)])
+                losses += [learn(std) for _ in range(updates)]
                 bar.update(args.envs)
-                if args.minutes and time.time() - began > 60 * args.minutes:
+                if out_of_time():
                     done = True
                     break
             if done:
@@ -324,11 +323,9 @@ def train(args, config, planner):
             if warming and decisions >= config.seed_decisions:  # catch up on the random episodes
                 for _ in tqdm(range(int(config.updates_per_step * decisions)), desc="first updates",
                               leave=False):
-                    if args.minutes and time.time() - began > 60 * args.minutes:
+                    if out_of_time():
                         break
-                    batch = replay.sample(rng, config.batch_size, config.horizon, args.task)
-                    losses.append([x.detach() for x in
-                                   learner.update(*map(to_device, batch), std)])
+                    losses.append(learn(std))
             recent = [[float(x) for x in row] for row in losses[-100:]]
             terms = np.mean(recent or [[0] * 3], 0)
             elapsed = seconds + time.time() - began
@@ -345,11 +342,13 @@ def train(args, config, planner):
                                  round(float(returns.mean()), 1), round(float(returns.min()), 1),
                                  round(float(returns.max()), 1), *(f"{t:.5g}" for t in terms)])
             kept = min(replay.count, len(replay.obs))
-            atomic_save({"settings": settings, "learner": learner.state(), "decisions": decisions,
-                         "seconds": elapsed, "obs": replay.obs[:kept],
-                         "action": replay.action[:kept], "reward": replay.reward[:kept],
-                         "count": replay.count, "rng": rng.bit_generator.state,
-                         "torch_rng": torch.get_rng_state()}, checkpoint)
+            state = {"settings": settings, "learner": learner.state(), "decisions": decisions,
+                     "seconds": elapsed, "obs": replay.obs[:kept],
+                     "action": replay.action[:kept], "reward": replay.reward[:kept],
+                     "count": replay.count, "rng": rng.bit_generator.state,
+                     "torch_rng": torch.get_rng_state()}
+            with fac.atomic_file(checkpoint) as file:
+                torch.save(state, file)
     return learner, replay, decisions, elapsed / 60, decisions >= args.decisions
 
 
