@@ -1188,6 +1188,8 @@ def _child_environment():
 
 
 def _run_worker(target, connection, *arguments):
+    # the mask alone is not enough: multiprocessing's resource tracker unblocks SIGINT as it starts
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with one_thread():
             target(connection, *arguments)
