@@ -42,6 +42,7 @@ import json
 import multiprocessing
 import multiprocessing.connection
 import os
+import pickle
 import signal
 import sys
 import tempfile
@@ -315,20 +316,16 @@ def linear_backward(dy, x, W, empty=np.empty):
     return dx, dW, dy.sum(2, keepdims=True)
 
 
-def _zeros_row(x):
-    return np.zeros(x.shape[-1], x.dtype)  # minimum with a row is 4 times as fast as with 0
-
-
 def elu(x, empty=np.empty):
-    """y = x where x > 0, else exp(x) - 1. As a maximum, since exp(x) - 1 >= x."""
-    y = np.minimum(x, _zeros_row(x), out=empty(x.shape, x.dtype))
+    """y = x where x > 0, else exp(x) - 1: the larger of x and exp(min(x, 0)) - 1."""
+    y = np.clip(x, -np.inf, 0, out=empty(x.shape, x.dtype))  # 3 times as fast as minimum
     np.expm1(y, out=y)
     return np.maximum(x, y, out=y)
 
 
 def elu_backward(dy, y):
     """y = elu(x): dy/dx is 1 where y > 0, else exp(x) = y + 1. Overwrites y with dx."""
-    np.minimum(y, _zeros_row(y), out=y)
+    np.clip(y, -np.inf, 0, out=y)
     y += 1
     y *= dy
     return y
@@ -809,48 +806,73 @@ def h_step_return(model, z, actions, config):
     return total + config.discount ** config.rewards * (q1 + q2) / 2
 
 
-class Returns:
-    """`h_step_return` in kept buffers, a block of samples at a time through the whole horizon.
+def homogeneous(params, layer):
+    """A layer as one matrix on inputs whose last row is 1: [[W, b], [0, 1]], (N, out+1, in+1)."""
+    W, b = params[f"{layer}.weight"], params[f"{layer}.bias"]
+    last = np.zeros((len(W), 1, W.shape[2] + 1), W.dtype)
+    last[..., -1] = 1
+    return np.concatenate([np.concatenate([W, b], 2), last], 1)
 
-    Three things make it fast. Networks that share their input share its first product
-    (dynamics with reward; both Q). The latent's part of the first product is computed once,
-    since all samples start from one latent. And LayerNorm's mean is taken out of the weights
-    beforehand: rows that are centred give outputs that are.
+
+def side_by_side(params, names, i):
+    """Layer i of several networks as one homogeneous matrix: their outputs, one below the other."""
+    return np.concatenate([homogeneous(params, f"{name}.{i}") for name in names], 1)
+
+
+class Returns:
+    """`h_step_return` in little more than the time of its matrix products.
+
+    Layers are homogeneous matrices: a bias costs no pass over the activations, and the row of
+    ones goes through ELU unchanged. Networks with the same input share its first product
+    (dynamics with reward; both Q). The latent's part of that product is computed once a plan, as
+    all samples start from one latent. LayerNorm's mean and gain are folded into the weights.
     """
-    BLOCK = 128  # samples; a block's activations stay in the processor's cache
 
     def __init__(self, model, config):
         self.config, self.sizes, p = config, model.config, model.params
-
-        def both(a, b):
-            return np.concatenate([p[a], p[b]], 1)
-
-        self.W1 = both("_dynamics.0.weight", "_reward.0.weight")        # (N, 2h, m + d)
-        self.b1 = both("_dynamics.0.bias", "_reward.0.bias")
-        self.second = [(p[f"{n}.2.weight"], p[f"{n}.2.bias"]) for n in ("_dynamics", "_reward")]
-        self.dynamics_out = p["_dynamics.4.weight"], p["_dynamics.4.bias"]
-        self.reward_out = p["_reward.4.weight"], p["_reward.4.bias"]
-        centred = [[p[f"{n}.0.{k}"] - p[f"{n}.0.{k}"].mean(1, keepdims=True)
-                    for n in ("_Q1", "_Q2")] for k in ("weight", "bias")]
-        self.Wq1, self.bq1 = (np.concatenate(pair, 1) for pair in centred)  # (N, 2h, m + d)
-        shape = (model.config.num_agents, 2, model.config.mlp_dim, 1)
-        self.gain, self.shift = (both(f"_Q1.1.{k}", f"_Q2.1.{k}").reshape(shape)
-                                 for k in ("weight", "bias"))
-        self.q_second = [(p[f"{n}.3.weight"], p[f"{n}.3.bias"]) for n in ("_Q1", "_Q2")]
-        self.Wq3 = np.concatenate([p["_Q1.5.weight"], p["_Q2.5.weight"]], 2) / 2  # (N, 1, 2h)
-        self.bq3 = (p["_Q1.5.bias"] + p["_Q2.5.bias"]) / 2
+        step, both_q = ("_dynamics", "_reward"), ("_Q1", "_Q2")
+        self.first = [side_by_side(p, step, 0), self._fold_norm(p)]     # (N, 2h + 2, m + d + 1)
+        self.second = [[homogeneous(p, f"{name}.{i}") for name in pair]  # (N, h + 1, h + 1)
+                       for pair, i in ((step, 2), (both_q, 3))]
+        self.to_latent, self.to_reward, *to_q = (
+            homogeneous(p, f"{name}.{i}")[:, :-1].copy()
+            for name, i in (*((name, 4) for name in step), *((name, 5) for name in both_q)))
+        self.to_q = np.concatenate(to_q, 2) / 2                         # (N, 1, 2h + 2)
+        # samples in a block: OpenBLAS is fastest on small matrices when the block fits the cache
+        self.block = 512 if model.config.mlp_dim >= 128 else 128
         self._buffers = {}
 
+    def _fold_norm(self, p):
+        """First layers of both Q, after which LayerNorm is y / sqrt(spread @ y^2 + eps) + shift.
+
+        Centred rows give centred outputs, and rows times their gain outputs times theirs;
+        `spread` takes the gains out of the variance again. The row of ones becomes zeros here,
+        and 20 by `shift`, which tanh takes to 1.
+        """
+        rows = (self.sizes.num_agents, 2, self.sizes.mlp_dim + 1)
+        W = side_by_side(p, ("_Q1", "_Q2"), 0).reshape(*rows, -1)
+        W[:, :, -1] = 0
+        W[:, :, :-1] -= W[:, :, :-1].mean(2, keepdims=True)
+        gain, self.shift = np.ones((*rows, 1), F32), np.full((*rows, 1), F32(20))
+        for i, name in enumerate(("_Q1", "_Q2")):
+            gain[:, i, :-1] = p[f"{name}.1.weight"]
+            self.shift[:, i, :-1] = p[f"{name}.1.bias"]
+        gain[np.abs(gain) < 1e-12] = 1e-12
+        W *= gain
+        self.spread = (1 / (self.sizes.mlp_dim * gain ** 2)).swapaxes(2, 3)
+        return W.reshape(len(W), -1, W.shape[-1])
+
     def start(self, z):
-        """Plan from the latent z (N, m, 1): the first products' latent parts."""
+        """Plan from the latent z (N, m, 1): at h = 0 the first products read (a, 1) only."""
         m = self.sizes.latent_dim
-        self.first = self.W1[:, :, :m] @ z + self.b1
-        self.first_q = self.Wq1[:, :, :m] @ z + self.bq1
+        self.first_at_start = [W[:, :, m:].copy() for W in self.first]  # (N, 2h + 2, d + 1)
+        for W, at_start in zip(self.first, self.first_at_start):
+            at_start[..., -1:] += W[:, :, :m] @ z
 
     def __call__(self, actions):
         """actions (N, L, d, S) -> G (N, S)."""
         samples = actions.shape[-1]
-        width = -(-samples // max(1, round(samples / self.BLOCK)))  # blocks of equal width
+        width = -(-samples // max(1, round(samples / self.block)))  # blocks of equal width
         total = np.zeros((len(actions), samples), F32)
         for begin in range(0, samples, width):
             part = slice(begin, min(begin + width, samples))
@@ -858,75 +880,58 @@ class Returns:
         return total
 
     def _make_buffers(self, width):
-        n, m, hidden = self.sizes.num_agents, self.sizes.latent_dim, self.sizes.mlp_dim
-        wide = (n, 2 * hidden, width)
-        return (np.empty((n, m + self.sizes.agent_actions, width), F32),
-                *(np.empty(wide, F32) for _ in range(3)), np.empty((n, 1, width), F32))
+        n, joint, hidden = (self.sizes.num_agents, self.sizes.latent_dim + self.sizes.agent_actions,
+                            2 * self.sizes.mlp_dim + 2)
+        return (np.ones((n, joint + 1, width), F32), np.empty((n, hidden, width), F32),
+                np.empty((n, hidden, width), F32), np.empty((n, 1, width), F32))
 
     def _block(self, actions, total):
-        width, m, hidden = actions.shape[-1], self.sizes.latent_dim, self.sizes.mlp_dim
+        """Equation 2 for a block of samples; adds to total (N, width)."""
+        width, m, half = actions.shape[-1], self.sizes.latent_dim, self.sizes.mlp_dim + 1
         if width not in self._buffers:
             self._buffers[width] = self._make_buffers(width)
-        x, y, y2, work, out = self._buffers[width]
-        discount = self.config.discount
+        x, y, y2, out = self._buffers[width]                            # x is (z, a, 1)
         for h in range(self.config.rewards):
-            x[:, m:] = actions[:, h]
-            self._first(self.W1, self.b1, self.first, h, x, y)
-            _elu(y, work)
-            self._second(self.second, y, y2)
-            _elu(y2, work)
-            np.matmul(self.reward_out[0], y2[:, hidden:], out=out)
-            out += self.reward_out[1]
-            out *= discount ** h
+            x[:, m:-1] = actions[:, h]
+            self._hidden(0, h, x, y, y2)
+            np.matmul(self.to_reward, y2[:, half:], out=out)
+            out *= self.config.discount ** h
             total += out[:, 0]
-            np.matmul(self.dynamics_out[0], y2[:, :hidden], out=x[:, :m])
-            x[:, :m] += self.dynamics_out[1]
+            np.matmul(self.to_latent, y2[:, :half], out=x[:, :m])
         h = self.config.rewards
-        x[:, m:] = actions[:, h]
-        self._first(self.Wq1, self.bq1, self.first_q, h, x, y)
-        self._norm_tanh(y, work)
-        self._second(self.q_second, y, y2)
-        _elu(y2, work)
-        np.matmul(self.Wq3, y2, out=out)
-        out += self.bq3
-        out *= discount ** h
+        x[:, m:-1] = actions[:, h]
+        self._hidden(1, h, x, y, y2)
+        np.matmul(self.to_q, y2, out=out)
+        out *= self.config.discount ** h
         total += out[:, 0]
 
-    def _first(self, W, b, start, h, x, y):
-        """First layer; at h = 0 only the action's columns, the latent's share is in `start`."""
+    def _hidden(self, pair, h, x, y, y2):
+        """Both hidden layers of a pair of networks (0: dynamics and reward, 1: the two Q)."""
         if h == 0:
-            m = self.sizes.latent_dim
-            np.matmul(W[:, :, m:], x[:, m:], out=y)
-            y += start
+            np.matmul(self.first_at_start[pair], x[:, self.sizes.latent_dim:], out=y)
         else:
-            np.matmul(W, x, out=y)
-            y += b
-
-    def _second(self, layers, y, y2):
-        hidden = self.sizes.mlp_dim
-        for i, (W, b) in enumerate(layers):
-            rows = slice(i * hidden, (i + 1) * hidden)
+            np.matmul(self.first[pair], x, out=y)
+        (_elu, self._norm_tanh)[pair](y, y2)
+        half = y.shape[1] // 2
+        for W, rows in zip(self.second[pair], (slice(0, half), slice(half, None))):
             np.matmul(W, y[:, rows], out=y2[:, rows])
-            y2[:, rows] += b
+        _elu(y2, y)
 
     def _norm_tanh(self, y, work):
-        """tanh(LayerNorm(y)) of both Q in place; y's mean is zero already."""
-        shape = (len(y), 2, self.sizes.mlp_dim, y.shape[-1])
-        y, work = y.reshape(shape), work.reshape(shape)
+        """tanh(LayerNorm(y)) of both Q in place, with a buffer."""
+        y, work = (b.reshape(*self.shift.shape[:3], -1) for b in (y, work))
         np.multiply(y, y, out=work)
-        scale = work.sum(2, keepdims=True)
-        scale /= self.sizes.mlp_dim
+        scale = self.spread @ work                                      # (N, 2, 1, S)
         scale += F32(NORM_EPS)
         np.sqrt(scale, out=scale)
         y /= scale
-        y *= self.gain
         y += self.shift
         np.tanh(y, out=y)
 
 
 def _elu(y, work):
     """`elu` in place, with a buffer."""
-    np.minimum(y, _zeros_row(y), out=work)
+    np.clip(y, -np.inf, 0, out=work)
     np.expm1(work, out=work)
     np.maximum(y, work, out=y)
 
@@ -941,15 +946,18 @@ def mppi(returns, mean, config, rngs, proposals=None):
     weights (N, E), which sum to 1.
     """
     mean, std = mean[..., None], F32(config.max_std)
+    if proposals is not None:
+        G_proposals = returns(proposals)
     for _ in range(config.iterations):
         actions = np.stack([rng.standard_normal((*mean.shape[1:3], config.samples), F32)
                             for rng in rngs])
         actions *= std
         actions += mean
         np.clip(actions, -1, 1, out=actions)
+        G = returns(actions)
         if proposals is not None:
             actions = np.concatenate([actions, proposals], -1)
-        G = returns(actions)
+            G = np.concatenate([G, G_proposals], 1)
         best = np.argpartition(-G, config.elites - 1, axis=1)[:, :config.elites]
         elites = np.take_along_axis(actions, best[:, None, None], 3)
         weights = np.take_along_axis(G, best, 1)
@@ -1019,12 +1027,8 @@ class Planner:
     def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
         sizes = model.config
         self.model, n = model, sizes.num_agents
-        if not 0 <= workers < n:
-            raise UserError(f"{workers} planning workers are no use to {n} agents, one of which "
-                            f"plans in this process; pass 0 to {n - 1}")
-        cuts = np.linspace(0, n, workers + 2).round().astype(int)
-        self._shares = [slice(i, j) for i, j in zip(cuts, cuts[1:])]
-        self._own = AgentPlanner(model.agents(0, cuts[1]), config)
+        self._shares = shares(n, workers)
+        self._own = AgentPlanner(model.agents(0, self._shares[0].stop), config)
         self._workers = self._z = self._actions = None
         if len(self._shares) > 1:
             context = multiprocessing.get_context("spawn")
@@ -1065,13 +1069,16 @@ class Planner:
             if not self._workers:
                 return self._own.plan(z).reshape(-1)
             self._z[:] = z
-            for i in range(len(self._shares) - 1):
-                self._workers.send(i, "plan")
+            self._workers.send_all("plan")
             self._actions[self._shares[0]] = self._own.plan(np.ascontiguousarray(
                 z[self._shares[0]]))
-            for i in range(len(self._shares) - 1):
-                self._workers.receive(i)
+            self._workers.receive_all()
             return self._actions.reshape(-1).copy()
+
+    def hand_over(self):
+        """Wake all workers and wait for their answers, without planning: what `act` pays."""
+        self._workers.send_all("hello")
+        self._workers.receive_all()
 
     def close(self):
         """End the worker processes."""
@@ -1085,16 +1092,31 @@ class Planner:
         self.close()
 
 
+def shares(agents, workers):
+    """Agents of this process and of each worker beside it, as slices; UserError for too many."""
+    if not 0 <= workers < agents:
+        raise UserError(f"{workers} workers are no use to {agents} agents, one of which is left "
+                        f"to this process; pass 0 to {agents - 1}")
+    cuts = np.linspace(0, agents, workers + 2).round().astype(int)
+    return [slice(i, j) for i, j in zip(cuts, cuts[1:])]
+
+
+def useful_workers(agents):
+    """As many processes beside this one as there are cores and agents for."""
+    return min(agents, os.cpu_count() or 1) - 1
+
+
 def _planning_worker(connection, raw_z, raw_actions, sizes):
-    """Plans for its share of the agents whenever told to; other messages are new streams."""
+    """Plans for its share of the agents when told to "plan"; a list is new random streams."""
     z, actions = Planner._views(raw_z, raw_actions, sizes)
     model, config, share = connection.recv()
-    planner = AgentPlanner(model, config)
+    planner, done = AgentPlanner(model, config), pickle.dumps(None)
     while True:
         message = connection.recv()
-        if isinstance(message, str):
+        if message == "plan":
             actions[share] = planner.plan(z[share].copy())
-            connection.send(True)
+        if isinstance(message, str):
+            connection.send_bytes(done)
         else:
             planner.reset(message)
 
@@ -1124,8 +1146,8 @@ class Workers:
 
     def send(self, i, message):
         """Send to worker i."""
-        try:
-            self._members[i][1].send(message)
+        try:  # plain pickle: the connection's own takes half of a hand-over
+            self._members[i][1].send_bytes(pickle.dumps(message))
         except (BrokenPipeError, ConnectionResetError):
             self._died(i)
 
@@ -1139,6 +1161,15 @@ class Workers:
             self.close()
             raise message
         return message
+
+    def send_all(self, message):
+        """Send to every worker."""
+        for i in range(len(self._members)):
+            self.send(i, message)
+
+    def receive_all(self):
+        """The next message of every worker, in their order."""
+        return [self.receive(i) for i in range(len(self._members))]
 
     def ready(self):
         """Indices of workers with a message (or an end), at least one: waits for it."""
@@ -1383,7 +1414,7 @@ class EnvironmentPool:
     def _call(self, command, values):
         for i, share in enumerate(self._shares):
             self._workers.send(i, (command, [values[j] for j in share]))
-        return [answer for i in range(len(self._shares)) for answer in self._workers.receive(i)]
+        return [answer for answers in self._workers.receive_all() for answer in answers]
 
     def reset(self, seeds):
         """One integer seed for each environment; returns observations (count, dim O)."""
@@ -1732,14 +1763,30 @@ def write_curve(path, curve):
         writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in row] for row in curve)
 
 
-def draw_curve(path, curve, title):
-    """Losses and rank correlations over the steps; False where matplotlib is missing."""
+def pyplot():
+    """matplotlib.pyplot, drawing without a display; UserError where it is missing."""
     try:
         import matplotlib
     except ImportError:
-        return False
+        raise UserError("pictures need matplotlib: pip install 'fac-tdmpc-ref[plots]'") from None
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    return plt
+
+
+def save_figure(path, figure):
+    """Write a figure as PNG and forget it."""
+    with atomic_file(path) as file:
+        figure.savefig(file, dpi=110, format="png")
+    pyplot().close(figure)
+
+
+def draw_curve(path, curve, title):
+    """Losses and rank correlations over the steps; False where matplotlib is missing."""
+    try:
+        plt = pyplot()
+    except UserError:
+        return False
     columns = dict(zip(CURVE, np.array(curve).T))
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
     for key, label in (("kl_reward", "rewards"), ("kl_value", "values")):
@@ -1752,9 +1799,7 @@ def draw_curve(path, curve, title):
     for axes in (left, right):
         axes.legend()
         axes.grid(alpha=0.3)
-    with atomic_file(path) as file:
-        figure.savefig(file, dpi=110, format="png")
-    plt.close(figure)
+    save_figure(path, figure)
     return True
 
 
@@ -1788,6 +1833,8 @@ def command_distill(args):
         raise UserError(f"{out}: can't be written: {error.strerror}") from None
     distiller = Distiller(expert, replay, config, args.num_agents, args.seed)
     num_agents = distiller.model_config.num_agents
+    beside = useful_workers(num_agents) if args.plan_workers is None else args.plan_workers
+    shares(num_agents, beside)  # refuses too many
     settings = {"task": args.task, "seed": args.seed, "num_agents": num_agents,
                 "distill": dataclasses.asdict(config),
                 "data": [checksum(expert.params.values()),
@@ -1814,10 +1861,11 @@ def command_distill(args):
         returns = evaluate(expert, args.task, planning, args.episodes, args.eval_seed, args.workers,
                            "evaluating the expert")["returns"]
     rows = replay.observation[np.random.default_rng(0).choice(distiller.held_out_starts, 22)]
-    beside = min(num_agents, os.cpu_count() or 1) - 1
     with Planner(expert, planning) as central, Planner(student, planning) as alone, \
             Planner(student, planning, workers=beside) as parallel:
         ms = measure_planning([central, alone, parallel], rows.astype(F32))
+    if args.plan_workers is None and ms[2] >= ms[1]:
+        beside, ms[2] = 0, ms[1]  # handing over costs more than it saves
 
     result = {
         "task": args.task, "seed": args.seed, "steps": config.steps, "seconds": round(seconds, 1),
@@ -1844,9 +1892,9 @@ def command_distill(args):
          f"{np.mean(returns):.0f} ± {np.std(returns):.0f}", f"{ms[0]:.1f}", "1.0"),
         (f"student, N = {num_agents}, one process",
          f"{result['student_return_mean']:.0f} ± {result['student_return_std']:.0f}",
-         f"{ms[1]:.1f}", f"{ms[0] / ms[1]:.1f}"),
+         f"{ms[1]:.1f}", f"{ms[0] / ms[1]:.1f}")] + [
         (f"student, {beside} worker{'s' * (beside != 1)} beside", "the same plans",
-         f"{ms[2]:.1f}", f"{ms[0] / ms[2]:.1f}")])
+         f"{ms[2]:.1f}", f"{ms[0] / ms[2]:.1f}")] * (beside > 0))
     print(f"\nreturn kept {np.mean(found['returns']) / max(np.mean(returns), 1e-9):.2f}, rank "
           f"correlation of Q {rank[0]:.3f} (h = 0) to {rank[-1]:.3f} (h = {len(rank) - 1}), "
           f"distilled in {seconds:.0f} s, {result['seconds_total']:.0f} s in all, {out}/"
@@ -1883,6 +1931,243 @@ def command_evaluate(args):
                  (task, str(args.episodes), f"{np.mean(returns):.0f} ± {np.std(returns):.0f}",
                   f"{min(returns):.0f}", f"{max(returns):.0f}", f"{found['plan_ms_median']:.1f}")])
     return result
+
+
+# robot: dim O, dim A (Figure 3), milliseconds of f_T, f_R, f_Q in TD-MPC and in Fac-TDMPC (Table 3)
+ROBOTS = {
+    "reacher": (8, 3, (5.83, 5.32, 11.73), (1.25, 1.02, 2.56)),
+    "hopper": (15, 4, (5.86, 5.34, 11.70), (0.83, 0.65, 1.71)),
+    "fish": (24, 5, (5.83, 5.26, 11.56), (0.77, 0.57, 1.53)),
+    "cheetah": (17, 6, (5.63, 5.06, 11.35), (0.75, 0.49, 1.34)),
+    "walker": (24, 6, (5.86, 5.28, 11.71), (0.72, 0.48, 1.32)),
+    "quadruped": (78, 12, (5.96, 5.34, 11.86), (0.63, 0.49, 0.96)),
+    "humanoid": (67, 21, (5.83, 5.25, 11.71), (0.42, 0.32, 0.69)),
+}
+FUNCTIONS = {"f_T": ("_dynamics",), "f_R": ("_reward",), "f_Q": ("_Q1", "_Q2")}
+TABLE3_BATCH = 512
+MODES = ("one-thread", "processes", "critical-path")
+
+
+class Predictor:
+    """f_T, f_R and f_Q alone, on fixed inputs in kept buffers: predictor("f_T").
+
+    workers: processes beside this one that share the agents; their inputs are there already.
+    """
+
+    def __init__(self, model, workers=0):
+        mine, *theirs = shares(model.config.num_agents, workers)
+        self.model, self._arena = model.agents(mine.start, mine.stop), Arena()
+        sizes = self.model.config
+        self._x = np.random.default_rng(0).standard_normal(
+            (sizes.num_agents, sizes.latent_dim + sizes.agent_actions, TABLE3_BATCH), F32)
+        self._workers = Workers(_prediction_worker, workers, "prediction worker")
+        for i, share in enumerate(theirs):
+            self._workers.send(i, model.agents(share.start, share.stop))
+
+    def __call__(self, function):
+        self._workers.send_all(function)
+        self._arena.rewind()
+        for name in FUNCTIONS[function]:
+            forward(QNET if function == "f_Q" else MLP, self.model.params, name, self._x,
+                    empty=self._arena.empty)
+        self._workers.receive_all()
+
+    def close(self):
+        """End the worker processes."""
+        self._workers.close()
+
+
+def _prediction_worker(connection):
+    predict, done = Predictor(connection.recv()), pickle.dumps(None)
+    while True:
+        predict(connection.recv())
+        connection.send_bytes(done)
+
+
+def multiply_adds(config, planner):
+    """Multiply-adds of a decision's networks, as Equation 2 reads (none saved)."""
+    cost = {name: agents * sum(a * b for a, b in zip(widths, widths[1:]))
+            for name, _, agents, widths in networks(config)}
+    step, value = cost["_dynamics"] + cost["_reward"], cost["_Q1"] + cost["_Q2"]
+    return planner.samples * planner.iterations * (planner.rewards * step + value)
+
+
+def take_turns(runs, turns, label):
+    """Seconds of functions that are called in turn, (turns, runs), so that noise hits all alike.
+
+    Also the seconds of one multiply-add in a product of 512 x 512 matrices, (turns,).
+    """
+    matrix, seconds = np.ones((512, 512), F32), np.zeros((turns, len(runs) + 1))
+    runs = [lambda: matrix @ matrix, *runs]
+    with progress(label, turns, "turn") as bar:
+        for turn in range(-1, turns):  # one more, which makes buffers
+            for i, run in enumerate(runs):
+                begin = time.perf_counter()
+                run()
+                seconds[turn, i] = time.perf_counter() - begin
+            bar.update(turn >= 0)
+    return seconds[:, 1:], seconds[:, 0] / 512 ** 3
+
+
+def benchmark_prediction(robot, workers, runs):
+    """Table 3 for one robot: rows of robot, model, function, mode, ms_mean, ms_std."""
+    _, n, *_ = ROBOTS[robot]
+    factored = random_model(robot, n, 512 // n, 512 // n)
+    with contextlib.ExitStack() as stack:
+        def predictor(*args):
+            return stack.enter_context(contextlib.closing(Predictor(*args)))
+
+        subjects = [("TD-MPC", "one-thread", predictor(random_model(robot, 1, 512, 512))),
+                    ("10% TD-MPC", "one-thread", predictor(random_model(robot, 1, 512, 66))),
+                    ("TAP", "one-thread", predictor(random_model(robot, 1, 512, 512, 2))),
+                    ("Fac-TDMPC", "one-thread", predictor(factored)),
+                    ("Fac-TDMPC", "processes", predictor(factored, workers)),
+                    ("Fac-TDMPC", "critical-path", predictor(factored.agents(0, 1)))]
+        calls = [(model, mode, f, functools.partial(predict, f))
+                 for model, mode, predict in subjects for f in FUNCTIONS]
+        seconds, _ = take_turns([call[-1] for call in calls], runs, f"{robot}: networks")
+    return [{"robot": robot, "model": model, "function": f, "mode": mode,
+             "ms_mean": 1e3 * float(s.mean()), "ms_std": 1e3 * float(s.std())}
+            for (model, mode, f, _), s in zip(calls, seconds.T)]
+
+
+def benchmark_decisions(robot, workers, planning, turns):
+    """Whole decisions for one robot: rows of robot, model, preset, mode, samples, iterations,
+    ms_median, floor_ms, ratio_to_floor; and the microseconds of a hand-over to the workers."""
+    _, n, *_ = ROBOTS[robot]
+    obs = np.random.default_rng(0).standard_normal(ROBOTS[robot][0], F32)
+    budgets = [planning] + [dataclasses.replace(planning, elites=0, **change) for change in
+                            ({"samples": 128}, {"iterations": 2})]  # Figure 7
+    presets = {"table2": ((50, 512), (50, max(512 // n, 50))),
+               "section51": ((512, 512), (512 // n, 512 // n))}
+    subjects = []
+    with contextlib.ExitStack() as stack:
+        def planner(model, config, workers=0):
+            return stack.enter_context(Planner(model, config, workers=workers))
+
+        for preset, (central, factored) in presets.items():
+            central, factored = random_model(robot, 1, *central), random_model(robot, n, *factored)
+            for config in budgets:
+                parallel = planner(factored, config, workers)
+                subjects += [
+                    ("TD-MPC", preset, "one-thread", central, config, planner(central, config).act),
+                    ("Fac-TDMPC", preset, "one-thread", factored, config,
+                     planner(factored, config).act),
+                    ("Fac-TDMPC", preset, "processes", factored, config, parallel.act),
+                    ("Fac-TDMPC", preset, "critical-path", factored.agents(0, 1), config,
+                     one_agent(factored, config))]
+        seconds, gemm = take_turns([functools.partial(subject[-1], obs) for subject in subjects],
+                                   turns, f"{robot}: decisions")
+        hand_over, _ = take_turns([parallel.hand_over], 200, f"{robot}: hand-over")
+    rows = []
+    for (model, preset, mode, measured, config, _), s in zip(subjects, seconds.T):
+        ms = 1e3 * float(np.median(s))
+        floor = 1e3 * float(np.median(gemm)) * multiply_adds(measured.config, config)
+        rows.append({"robot": robot, "model": model, "preset": preset, "mode": mode,
+                     "samples": config.samples, "iterations": config.iterations,
+                     "ms_median": ms, "floor_ms": floor, "ratio_to_floor": ms / floor})
+    return rows, 1e6 * float(np.median(hand_over))
+
+
+def one_agent(model, config):
+    """A decision's critical path: the encoder, then the plan of one agent (all are of one size)."""
+    alone = AgentPlanner(model.agents(0, 1), config)
+    alone.reset(np.random.SeedSequence(0).spawn(1))
+    return lambda obs: alone.plan(model.encode(obs[:, None])[:1])
+
+
+def random_model(robot, num_agents, latent_dim, mlp_dim, dim_action=None):
+    """A model of a robot's dimensions with fresh weights."""
+    dim_obs, actions, *_ = ROBOTS[robot]
+    return WorldModel.create(ModelConfig(dim_obs, dim_action or actions, num_agents, latent_dim,
+                                         256, mlp_dim), np.random.default_rng(0))
+
+
+def speedups(prediction, decision, planning):
+    """TD-MPC's time over Fac-TDMPC's: rows of robot, function, mode, value, paper (Table 3)."""
+    ms = {(r["robot"], r["function"], r["model"], r["mode"]): r["ms_mean"] for r in prediction}
+    ms.update({(r["robot"], "decision", r["model"], r["mode"]): r["ms_median"] for r in decision
+               if (r["preset"], r["samples"], r["iterations"]) ==
+               ("section51", planning.samples, planning.iterations)})
+    paper = {(robot, f): central / factored for robot, (_, _, *times) in ROBOTS.items()
+             for f, central, factored in zip(FUNCTIONS, *times)}
+    return [{"robot": robot, "function": f, "mode": mode,
+             "value": value / ms[robot, f, "Fac-TDMPC", mode], "paper": paper.get((robot, f))}
+            for (robot, f, model, _), value in ms.items() if model == "TD-MPC" for mode in MODES]
+
+
+def command_benchmark(args):
+    """benchmark: Table 3 and whole decisions on this machine."""
+    (planning,) = args.configs
+    for robot in args.robots:
+        if robot not in ROBOTS:
+            raise UserError(f"unknown robot {robot!r}; known: {', '.join(ROBOTS)}")
+    if args.runs < 10:
+        raise UserError(f"runs must be at least 10, not {args.runs}")
+    if args.figure:
+        pyplot()  # before the work, not after it
+    prediction, decision, hand_overs = [], [], []
+    with one_thread():
+        for robot in args.robots:
+            agents = ROBOTS[robot][1]
+            workers = (useful_workers(agents) if args.workers is None
+                       else min(args.workers, agents - 1))
+            prediction += benchmark_prediction(robot, workers, args.runs)
+            rows, hand_over = benchmark_decisions(robot, workers, planning, args.runs // 10)
+            decision += rows
+            hand_overs.append(hand_over)
+    result = {"prediction": prediction, "decision": decision,
+              "speedup": speedups(prediction, decision, planning),
+              "handover_us": float(np.median(hand_overs)), "cores": os.cpu_count() or 1}
+    print_benchmark(result, args.robots)
+    if args.figure:
+        draw_prediction(args.figure, prediction, args.robots)
+    return result
+
+
+def print_benchmark(result, robots):
+    """Table 3, the speed-ups beside the paper's, and the decisions."""
+    times = {(r["robot"], r["function"], r["model"], r["mode"]):
+             f"{r['ms_mean']:.2f} ± {r['ms_std']:.2f}" for r in result["prediction"]}
+    ratio = {(r["robot"], r["function"], r["mode"]): r for r in result["speedup"]}
+    columns = [(m, "one-thread") for m in ("TD-MPC", "10% TD-MPC", "TAP", "Fac-TDMPC")]
+    columns += [("Fac-TDMPC", mode) for mode in MODES[1:]]
+    print(f"\nPrediction, ms, batch {TABLE3_BATCH}, mean ± sd; x: TD-MPC's time over Fac-TDMPC's, "
+          f"one thread / processes / one agent alone (paper: N threads)\n")
+    print_table([("", "", *(m if mode == "one-thread" else mode for m, mode in columns), "x",
+                  "paper's x")] + [
+        (robot, f, *(times[robot, f, *column] for column in columns),
+         " / ".join(f"{ratio[robot, f, mode]['value']:.1f}" for mode in MODES),
+         f"{ratio[robot, f, 'one-thread']['paper']:.1f}") for robot in robots for f in FUNCTIONS])
+    print("\nOne decision, ms, median (times the GEMM floor)\n")
+    rows = {}
+    for r in result["decision"]:
+        key = r["robot"], r["preset"], f"{r['samples']} x {r['iterations']}"
+        rows.setdefault(key, []).append((r["ms_median"], r["ratio_to_floor"]))
+    print_table([("", "sizes", "budget", "TD-MPC", "Fac-TDMPC", *MODES[1:], "x")] + [
+        (*key, *(f"{ms:.2f} ({times_floor:.2f})" for ms, times_floor in cells),
+         " / ".join(f"{cells[0][0] / ms:.1f}" for ms, _ in cells[1:]))
+        for key, cells in rows.items()])
+    print(f"\na hand-over to the workers and back: {result['handover_us']:.0f} us; "
+          f"{result['cores']} cores")
+
+
+def draw_prediction(path, prediction, robots):
+    """Figure 6: prediction times as bars, logarithmic."""
+    plt = pyplot()
+    subjects = list(dict.fromkeys((r["model"], r["mode"]) for r in prediction))
+    figure, axes = plt.subplots(3, 1, figsize=(10, 8), layout="constrained", sharex=True)
+    for ax, function in zip(axes, FUNCTIONS):
+        for i, (model, mode) in enumerate(subjects):
+            rows = [r for r in prediction if (r["function"], r["model"], r["mode"]) ==
+                    (function, model, mode)]
+            ax.bar(np.arange(len(robots)) + (i - 2.5) * 0.14, [r["ms_mean"] for r in rows], 0.13,
+                   yerr=[r["ms_std"] for r in rows], label=f"{model}, {mode}")
+        ax.set(yscale="log", ylabel=f"${function}$, ms")
+        ax.grid(axis="y", alpha=0.3)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    axes[-1].set_xticks(range(len(robots)), [f"{r}, N = {ROBOTS[r][1]}" for r in robots])
+    save_figure(path, figure)
 
 
 def add_config(parser, config_class, title=None, prefix="", **defaults):
@@ -1956,6 +2241,9 @@ def make_parser():
     sub.add_argument("--eval-seed", type=natural, default=0, help="of the evaluation episodes [0]")
     sub.add_argument("--workers", type=natural, help="processes that run episodes side by side; 0: "
                      "all in this one [cores]")
+    sub.add_argument("--plan-workers", type=natural, help="processes beside this one that plan for "
+                     "a share of the agents, where planning is timed [one for every further core "
+                     "if that is faster than none]")
     sub.add_argument("--evaluate-expert", action="store_true",
                      help="measure the expert's return anew instead of reading its record")
     add_config(sub, DistillConfig)
@@ -1972,6 +2260,19 @@ def make_parser():
     sub.add_argument("--record", action="store_true",
                      help="write the returns into the model's header, where distill finds them")
     add_config(sub, PlannerConfig)
+
+    sub = command("benchmark", command_benchmark, "Planning speed: Table 3 (the networks) and whole "
+                  "decisions, centralized and factored, by threads and processes.",
+                  epilog="Fresh weights: speed doesn't depend on what a model has learned. Keep the "
+                  "machine quiet, and read ratios.")
+    sub.add_argument("--robots", nargs="+", default=list(ROBOTS), metavar="ROBOT",
+                     help="some of: " + ", ".join(ROBOTS) + " [all]")
+    sub.add_argument("--workers", type=natural, help="processes beside this one, at most "
+                     "one for each further agent [as many as there are cores for]")
+    sub.add_argument("--runs", type=int, default=100, help="of each network; decisions are timed a "
+                     "tenth as often [100]")
+    sub.add_argument("--figure", help="draw Figure 6 into this file")
+    add_config(sub, PlannerConfig, horizon=3)
     return parser
 
 
@@ -1984,7 +2285,8 @@ def main(argv=None):
                 from_args(config, args, **(paper_preset(config) if args.preset == "paper" else {}))
                 for config in (DistillConfig, PlannerConfig))
         else:
-            args.configs = (from_args(PlannerConfig, args),)
+            paper = {"horizon": 3} if args.command == "benchmark" else {}
+            args.configs = (from_args(PlannerConfig, args, **paper),)
         result = args.run(args)
     except UserError as error:
         print(f"fac_tdmpc_ref.py: error: {error}", file=sys.stderr)

@@ -135,7 +135,8 @@ except SystemExit as end:
 
 
 @pytest.mark.parametrize("command, expected", [
-    ((), ["distill", "evaluate"]),
+    ((), ["distill", "evaluate", "benchmark"]),
+    (("benchmark",), ["--robots", "humanoid", "--figure", "--iterations", "[3; paper: 3]"]),
     (("distill",), ["--task", "--preset", "--num-agents", "--evaluate-expert", "--plan-samples",
                     "[20000; paper: 100000]", "[forward; paper: reverse]", "reacher-hard"]),
     (("evaluate",), ["--model", "--record", "--samples", "--output", "[6]"])])
@@ -152,7 +153,8 @@ def test_every_setting_has_a_flag_in_help():
     subparsers = fac.make_parser()._subparsers._group_actions[0].choices
     for command, config_class, prefix in (("distill", fac.DistillConfig, ""),
                                           ("distill", fac.PlannerConfig, "plan-"),
-                                          ("evaluate", fac.PlannerConfig, "")):
+                                          ("evaluate", fac.PlannerConfig, ""),
+                                          ("benchmark", fac.PlannerConfig, "")):
         text = subparsers[command].format_help()
         for f in dataclasses.fields(config_class):
             assert f"--{prefix}{f.name}".replace("_", "-") in text
@@ -164,7 +166,7 @@ def test_every_setting_has_a_flag_in_help():
 def configs_of(monkeypatch, *arguments):
     """The configs that a command line leads to."""
     caught = []
-    for command in ("command_distill", "command_evaluate"):
+    for command in ("command_distill", "command_evaluate", "command_benchmark"):
         monkeypatch.setattr(fac, command, lambda args: caught.append(args.configs))
     assert fac.main([str(a) for a in arguments]) == 0
     return caught[0]
@@ -173,6 +175,7 @@ def configs_of(monkeypatch, *arguments):
 def test_default_settings_are_those_of_the_dataclasses(monkeypatch):
     assert configs_of(monkeypatch, "distill") == (fac.DistillConfig(), fac.PlannerConfig())
     assert configs_of(monkeypatch, "evaluate", "--model", "x") == (fac.PlannerConfig(),)
+    assert configs_of(monkeypatch, "benchmark") == (fac.PlannerConfig(horizon=3),)  # Table 2
 
 
 def test_preset_paper_is_the_paper(monkeypatch):
@@ -264,6 +267,7 @@ def refused(done, *parts):
     (["--plan-min-std", "3"], ["min_std", "max_std"]),
     (["--episodes", "0"], ["episodes", "at least 1"]),
     (["--workers", "-1"], ["--workers", "-1"]),
+    (["--plan-workers", "3"], ["3 workers", "0 to 2"]),
     (["--seed", "-1"], ["--seed", "-1"]),
     (["--eval-seed", "x"], ["--eval-seed", "'x'"]),
     (["--stepz", "3"], ["--stepz"]),
@@ -284,6 +288,10 @@ def test_distill_refuses(tmp_path, files, flags, parts):
     ([], ["COMMAND"]),
     (["train"], ["'train'", "distill"]),
     (["evaluate"], ["--model"]),
+    (["benchmark", "--robots", "reecher"], ["'reecher'", *fac.ROBOTS]),
+    (["benchmark", "--runs", "9"], ["runs", "at least 10"]),
+    (["benchmark", "--workers", "-1"], ["--workers", "-1"]),
+    (["benchmark", "--elites", "600"], ["600 elites", "512 samples"]),
     (["evaluate", "--model", "none.npz"], ["none.npz", "no such file"]),
     (["evaluate", "--model", "{files}/corrupt.npz"], ["corrupt.npz", "not a readable .npz"]),
     (["evaluate", "--model", "{files}/replay.npz"], ["replay.npz", "expert or student"]),
@@ -314,6 +322,53 @@ def test_a_student_is_no_expert(tmp_path, files, distilled):
     _, folder = distilled
     done = run(*distill_arguments(files, "--expert", folder / "student.npz"), cwd=tmp_path)
     refused(done, "student.npz", "kind", "'expert'", "'student'")
+
+
+# benchmark ----------------------------------------------------------------------------
+
+
+def test_the_benchmark_refuses_a_picture_it_cannot_draw(tmp_path, no_plots):
+    refused(run("benchmark", "--figure", "x.png", cwd=tmp_path, env=no_plots), "matplotlib")
+
+
+def test_benchmark_measures_every_mode(tmp_path):
+    flags = ["--robots", "reacher", "hopper", "--runs", "10", "--samples", "16", "--iterations",
+             "1", "--json"]
+    if importlib.util.find_spec("matplotlib"):
+        flags += ["--figure", "figure6.png"]
+    done = run("benchmark", *flags, cwd=tmp_path)
+    found = last_json(done)
+    assert set(found) == {"prediction", "decision", "speedup", "handover_us", "cores"}
+    assert found["cores"] == os.cpu_count() and found["handover_us"] > 0
+    modes, functions = ("one-thread", "processes", "critical-path"), ("f_T", "f_R", "f_Q")
+    rows = {(r["robot"], r["model"], r["function"], r["mode"]): r for r in found["prediction"]}
+    assert set(rows) == {(robot, *subject) for robot in ("reacher", "hopper") for subject in (
+        *((m, f, "one-thread") for m in ("TD-MPC", "10% TD-MPC", "TAP") for f in functions),
+        *(("Fac-TDMPC", f, mode) for f in functions for mode in modes))}
+    assert all(r["ms_mean"] > 0 and r["ms_std"] >= 0 for r in rows.values())
+    # 9 and 16 times the multiply-adds in one agent's networks: any machine sees that
+    for robot in ("reacher", "hopper"):
+        assert rows[robot, "TD-MPC", "f_T", "one-thread"]["ms_mean"] > \
+            2 * rows[robot, "Fac-TDMPC", "f_T", "critical-path"]["ms_mean"]
+    decisions = {(r["robot"], r["model"], r["preset"], r["mode"], r["samples"], r["iterations"]): r
+                 for r in found["decision"]}
+    assert len(decisions) == len(found["decision"]) == 2 * 2 * 4 * 3
+    for r in decisions.values():
+        assert np.isclose(r["ratio_to_floor"], r["ms_median"] / r["floor_ms"])
+    speedup = {(r["robot"], r["function"], r["mode"]): r for r in found["speedup"]}
+    assert set(speedup) == {(robot, f, mode) for robot in ("reacher", "hopper")
+                            for f in (*functions, "decision") for mode in modes}
+    assert round(speedup["reacher", "f_T", "critical-path"]["paper"], 1) == 4.7
+    assert round(speedup["hopper", "f_T", "processes"]["paper"], 1) == 7.1
+    row = speedup["hopper", "decision", "one-thread"]
+    times = [decisions["hopper", m, "section51", "one-thread", 16, 1]["ms_median"]
+             for m in ("TD-MPC", "Fac-TDMPC")]
+    assert row["paper"] is None and np.isclose(row["value"], times[0] / times[1])
+    for part in ("hopper", "critical-path", "paper's x", "16 x 1", "hand-over"):
+        assert part in done.stdout
+    assert os.listdir(tmp_path) == ["figure6.png"] * ("--figure" in flags)
+    if "--figure" in flags:
+        assert (tmp_path / "figure6.png").read_bytes()[:4] == b"\x89PNG"
 
 
 # distill ------------------------------------------------------------------------------

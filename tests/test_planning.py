@@ -262,3 +262,34 @@ def test_an_unguarded_script_gets_an_error_not_a_hang(tmp_path):
                       "fac.Planner(random_model(hidden=400), workers=1)\n")
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60)
     assert done.returncode != 0 and "__main__" in done.stderr
+
+
+def test_multiply_adds_count_the_weights_of_equation_2():
+    model = random_model(3)
+    sizes = {name: sum(v.size for k, v in model.params.items() if k.startswith(name)
+                       and k.endswith("weight") and v.shape[2] > 1)
+             for name in ("_dynamics", "_reward", "_Q")}
+    config = fac.PlannerConfig(samples=7, iterations=2, horizon=3)
+    assert fac.multiply_adds(model.config, config) == 7 * 2 * (
+        3 * (sizes["_dynamics"] + sizes["_reward"]) + sizes["_Q"])
+
+
+def test_handing_over_leaves_the_plan_alone():
+    config, obs = fac.PlannerConfig(samples=16, iterations=1), np.ones(8, np.float32)
+    with fac.Planner(random_model(), config, seed=1, workers=1) as planner:
+        planner.hand_over()
+        found = planner.act(obs)
+        planner.reset(1)
+        assert np.array_equal(found, planner.act(obs))
+
+
+def test_a_gain_of_zero_is_a_gain_all_the_same():
+    model, rng = random_model(), np.random.default_rng(3)
+    model.params["_Q1.1.weight"][:, :4] = 0
+    config = fac.PlannerConfig(horizon=2)
+    z = model.encode(rng.standard_normal((8, 1), np.float32))
+    actions = rng.uniform(-1, 1, (3, 3, 1, 9)).astype(np.float32)
+    fast = fac.Returns(model, config)
+    fast.start(z)
+    plain = fac.h_step_return(model, z, actions, config)
+    assert np.abs(fast(actions) - plain).max() < 1e-5 * np.abs(plain).max()

@@ -1,0 +1,239 @@
+"""NumPy against PyTorch on one machine, in one run: `python tests/bench_peer.py [--json]`.
+
+The same models, the same MPPI and the same distillation step, written plainly in PyTorch
+(eager, `inference_mode`; batched `baddbmm` for the agents; `torch.compile` where it works).
+Both take turns, so that noise hits both; figures are medians of NumPy's time over PyTorch's in
+the same turn, below 1 is faster. Sizes are section 5.1's (latent and hidden 512 // N), MPPI is
+Table 2's (512 samples, 6 iterations, horizon 3).
+"""
+import argparse
+import contextlib
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
+import torch.nn.functional as F  # noqa: E402
+
+import fac_tdmpc_ref as fac  # noqa: E402
+
+
+def run_network(kinds, params, name, x):
+    """A network of (N, in, out) weights on x (N, B, in), samples in PyTorch's place."""
+    for i, kind in enumerate(kinds):
+        if kind == "linear" and len(x) == 1:
+            x = F.linear(x[0], params[f"{name}.{i}.weight"][0].T, params[f"{name}.{i}.bias"][0, 0])
+            x = x[None]
+        elif kind == "linear":
+            x = torch.baddbmm(params[f"{name}.{i}.bias"], x, params[f"{name}.{i}.weight"])
+        elif kind == "norm":
+            x = F.layer_norm(x, x.shape[-1:])
+            x = x * params[f"{name}.{i}.weight"] + params[f"{name}.{i}.bias"]
+        else:
+            x = F.elu(x) if kind == "elu" else torch.tanh(x)
+    return x
+
+
+def to_torch(model):
+    """Weights as (N, in, out) and biases as (N, 1, out): what baddbmm takes without copies."""
+    return {k: torch.tensor(np.ascontiguousarray(v.swapaxes(1, 2))) for k, v in
+            model.params.items()}
+
+
+class TorchPlanner:
+    """MPPI for a model without policy, plainly: Equations 2 and 3 with a batch of agents."""
+
+    def __init__(self, model, config):
+        self.sizes, self.config, self.params = model.config, config, to_torch(model)
+        self.mean = torch.zeros(self.sizes.num_agents, config.rewards + 1, 1,
+                                self.sizes.agent_actions)
+
+    def returns(self, z, actions):
+        """Equation 2: z (N, S, m), actions (N, L, S, d) -> (N, S)."""
+        total, config, p = 0.0, self.config, self.params
+        for h in range(config.rewards):
+            x = torch.cat([z, actions[:, h]], -1)
+            total = total + config.discount ** h * run_network(fac.MLP, p, "_reward", x)[..., 0]
+            z = run_network(fac.MLP, p, "_dynamics", x)
+        x = torch.cat([z, actions[:, -1]], -1)
+        q = run_network(fac.QNET, p, "_Q1", x) + run_network(fac.QNET, p, "_Q2", x)
+        return total + config.discount ** config.rewards * q[..., 0] / 2
+
+    @torch.inference_mode()
+    def act(self, obs):
+        """Observation (O,) to action (A,), with the warm start kept."""
+        n, config = self.sizes.num_agents, self.config
+        z = run_network(fac.ENCODER, self.params, "_encoder", torch.from_numpy(obs)[None, None])
+        z = z.view(n, 1, -1).expand(-1, config.samples, -1)
+        mean, std = self.mean, torch.tensor(config.max_std)
+        for _ in range(config.iterations):
+            noise = torch.randn(n, config.rewards + 1, config.samples, self.sizes.agent_actions)
+            actions = (mean + std * noise).clamp(-1, 1)
+            top, index = self.returns(z, actions).topk(config.elites, 1)
+            elites = actions.gather(2, index[:, None, :, None].expand(-1, *actions.shape[1:2], -1,
+                                                                      actions.shape[-1]))
+            score = torch.softmax(config.temperature * top, 1)[:, None, :, None]
+            new = (score * elites).sum(2, keepdim=True)
+            std = (score * (elites - new) ** 2).sum(2, keepdim=True).sqrt()
+            std = std.clamp(config.min_std, config.max_std)
+            mean = config.momentum * mean + (1 - config.momentum) * new
+        self.mean = torch.cat([mean[:, 1:], torch.zeros_like(mean[:, :1])], 1)
+        pick = torch.multinomial(score[:, 0, :, 0], 1)
+        return elites[torch.arange(n), 0, pick[:, 0]].flatten().numpy()
+
+
+def make_model(n, dim_action, seed=0):
+    """Section 5.1's sizes for N agents, with random weights (last layers too)."""
+    width, rng = 512 // n, np.random.default_rng(seed)
+    config = fac.ModelConfig(24, dim_action, n, width, 256, width)
+    model = fac.WorldModel.create(config, rng)
+    for value in model.params.values():
+        value += 0.05 * rng.standard_normal(value.shape, np.float32)
+    return model
+
+
+def ratios(ours, theirs, turns):
+    """Median over turns of our seconds over theirs, after one turn that isn't counted."""
+    found = []
+    for _ in range(turns + 1):
+        seconds = []
+        for run in (ours, theirs):
+            begin = time.perf_counter()
+            run()
+            seconds.append(time.perf_counter() - begin)
+        found.append(seconds)
+    seconds = np.array(found[1:])
+    return float(np.median(seconds[:, 0] / seconds[:, 1])), *1e3 * np.median(seconds, 0)
+
+
+def planning(n, dim_action, turns, compiled=False):
+    """(ratio, our ms, PyTorch's ms) of one decision, one thread each."""
+    model, config = make_model(n, dim_action), fac.PlannerConfig(horizon=3)
+    obs = np.random.default_rng(1).standard_normal(24).astype(np.float32)
+    theirs = TorchPlanner(model, config)
+    z, actions = torch.randn(n, 7, model.config.latent_dim), torch.rand(n, 4, 7, dim_action // n)
+    expected = fac.h_step_return(model, z[:, :1].numpy().swapaxes(1, 2),
+                                 actions.numpy().swapaxes(2, 3), config)
+    with torch.inference_mode():
+        found = theirs.returns(z[:, :1].expand(-1, 7, -1), actions).numpy()
+    assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max(), "the models differ"
+    if compiled:
+        theirs.returns = torch.compile(theirs.returns)
+    torch.set_num_threads(1)
+    with fac.Planner(model, config) as ours:
+        return ratios(lambda: ours.act(obs), lambda: theirs.act(obs), turns)
+
+
+class TorchDistiller:
+    """Algorithm 1 with the same networks, batch and settings as fac.Distiller."""
+
+    def __init__(self, distiller, replay):
+        self.config, self.agents = distiller.config, distiller.model_config.num_agents
+        self.expert, self.student = to_torch(distiller.expert), to_torch(distiller.student)
+        self.trained = [p.requires_grad_() for k, p in self.student.items()
+                        if not k.startswith("_expert")]
+        self.optimizer = torch.optim.Adam(self.trained, lr=self.config.lr)
+        self.obs = torch.tensor(replay.observation.astype(np.float32))
+        self.action = torch.tensor(replay.action.astype(np.float32))
+        self.starts = torch.tensor(distiller.train_starts)
+
+    @staticmethod
+    def rollout(params, z, actions):
+        """Rewards and both Q, (L, B * K): z (N, B * K, m), actions (L, B * K, N, d)."""
+        outputs = []
+        for a in actions:
+            x = torch.cat([z, a.transpose(0, 1)], -1)
+            outputs.append([run_network(kinds, params, name, x).sum(0)[:, 0]
+                            for name, kinds in fac.HEADS])
+            z = run_network(fac.MLP, params, "_dynamics", x)
+        return [torch.stack(head) for head in zip(*outputs)]
+
+    def step(self):
+        """One gradient step on a fresh batch; returns the loss."""
+        config = self.config
+        steps, batch, noise = config.horizon + config.final_term, config.batch_size, \
+            config.noise_samples
+        with torch.no_grad():
+            rows = self.starts[torch.randint(len(self.starts), (batch,))]
+            actions = self.action[rows + torch.arange(steps)[:, None]].repeat_interleave(noise, 1)
+            span = np.log([config.noise_std_min, config.noise_std])
+            std = torch.empty(batch).uniform_(*span).exp().repeat_interleave(noise)[:, None]
+            actions = (actions + std * torch.randn_like(actions)).clamp(-1, 1)
+            latent = run_network(fac.ENCODER, self.expert, "_encoder", self.obs[rows][None])
+            targets = self.rollout(self.expert, latent.repeat_interleave(noise, 1),
+                                   actions[:, :, None])
+        z = run_network(fac.ENCODER, self.student, "_encoder", latent)
+        z = z.view(batch, self.agents, -1).transpose(0, 1).repeat_interleave(noise, 1)
+        outputs = self.rollout(self.student, z, actions.view(*actions.shape[:2], self.agents, -1))
+        loss, coefs = 0.0, (config.reward_coef, config.value_coef, config.value_coef)
+        for coef, ours, theirs in zip(coefs, outputs, targets):
+            kl = F.kl_div(F.log_softmax(ours.view(steps, batch, noise)
+                                        / config.temperature_student, -1),
+                          F.log_softmax(theirs.view(steps, batch, noise)
+                                        / config.temperature_expert, -1),
+                          reduction="none", log_target=True).sum(-1)
+            weights = config.lam ** torch.arange(steps)[:, None]
+            loss = loss + coef * (weights * kl).sum() / batch
+        self.optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.trained, config.grad_clip)
+        self.optimizer.step()
+        return loss.item()
+
+
+def distillation(threads, turns):
+    """(ratio, our ms, PyTorch's ms) of a distillation step of reacher-hard's default settings.
+
+    One thread: both on one core; two: ours has the expert's side on the second.
+    """
+    expert, _ = fac.load_model(fac.data_file("reacher-hard", "expert.npz"))
+    replay = fac.Replay(fac.data_file("reacher-hard", "replay.npz"))
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, list(cores)[:threads])
+    torch.set_num_threads(threads)
+    try:
+        with contextlib.closing(fac.Distiller(expert, replay, fac.DistillConfig())) as ours:
+            theirs = TorchDistiller(ours, replay)
+            return ratios(lambda: [ours.step() for _ in range(20)],
+                          lambda: [theirs.step() for _ in range(20)], turns)
+    finally:
+        os.sched_setaffinity(0, cores)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--turns", type=int, default=9, help="of each comparison [9]")
+    parser.add_argument("--json", action="store_true", help="print one JSON object as last line")
+    args = parser.parse_args()
+    result = {"central_ratio": None, "fac_ratio": {}, "distill_ratio": {}, "cores": os.cpu_count(),
+              "torch": torch.__version__, "numpy": np.__version__}
+
+    def show(what, found, threads=1):
+        per = 20 if what.startswith("distillation") else 1
+        print(f"{what:<42}{threads} thread{'s' * (threads > 1):<2} NumPy {found[1] / per:7.1f} ms"
+              f"  PyTorch {found[2] / per:7.1f} ms  ratio {found[0]:.2f}", flush=True)
+        return found[0]
+
+    result["central_ratio"] = show("plan, TD-MPC (N = 1, latent 512)", planning(1, 6, args.turns))
+    for n in (3, 6, 12, 21):
+        result["fac_ratio"][str(n)] = show(f"plan, Fac-TDMPC (N = {n})", planning(n, n, args.turns))
+    for n in (1, 6):
+        try:
+            show(f"plan, N = {n}, torch.compile", planning(n, 6, args.turns, compiled=True))
+        except Exception as error:  # no compiler on this machine, for one
+            print(f"torch.compile, N = {n}: does not work here ({type(error).__name__})")
+    for threads in (1, 2):
+        if threads <= len(os.sched_getaffinity(0)):
+            result["distill_ratio"][str(threads)] = show(
+                "distillation step", distillation(threads, args.turns), threads)
+    if args.json:
+        print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()
