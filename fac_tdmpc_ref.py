@@ -26,7 +26,7 @@ A layer is W (N, out, in), b (N, out, 1) and computes W @ x + b on x (N, in, B):
 that activations run over long contiguous rows, and a torch Linear.weight goes in as weight[None].
 Rewards and values come out as (N, B), agent i's share; the global one is their sum over N.
 
-Read it from top to bottom: 1 configuration, 2 layers, 3 world model, 4 Equation 1 (to come),
+Read it from top to bottom: 1 configuration, 2 layers, 3 world model, 4 Equation 1,
 5 distillation, 6 planning, 7 environments, 8 data, 9 experiments and command line. Departures
 from the paper are tagged [D1], [D2], ...; the README lists them with what each bought.
 """
@@ -309,9 +309,14 @@ def linear(x, W, b, empty=np.empty):
     return y
 
 
+def linear_input_backward(dy, x, W, empty=np.empty):
+    """Gradient of y = W x + b by x: W^T dy."""
+    return np.matmul(W.swapaxes(1, 2), dy, out=empty(x.shape, x.dtype))
+
+
 def linear_backward(dy, x, W, empty=np.empty):
     """Gradients of y = W x + b: dx = W^T dy, dW = dy x^T, db = sum over B of dy."""
-    dx = np.matmul(W.swapaxes(1, 2), dy, out=empty(x.shape, x.dtype))
+    dx = linear_input_backward(dy, x, W, empty)
     dW = np.matmul(dy, x.swapaxes(1, 2), out=empty(W.shape, x.dtype))
     return dx, dW, dy.sum(2, keepdims=True)
 
@@ -387,17 +392,20 @@ def forward(kinds, params, name, x, tape=None, empty=np.empty):
 
 
 def backward(kinds, params, name, tape, dy, grads, empty=np.empty):
-    """Walk `forward` back: adds parameter gradients to `grads`, returns dx (N, in, B).
+    """Walk `forward` back: adds parameter gradients to `grads` (None: not wanted), returns dx.
 
     Uses the tape up: activations are overwritten by gradients on the way.
     """
     for i in reversed(range(len(kinds))):
         kind, x, y = kinds[i], tape[i], tape[i + 1]
-        if kind in ("linear", "norm"):
+        if kind == "linear" and grads is None:
+            dy = linear_input_backward(dy, x, params[f"{name}.{i}.weight"], empty)
+        elif kind in ("linear", "norm"):
             layer_backward = linear_backward if kind == "linear" else norm_backward
             dy, dW, db = layer_backward(dy, x, params[f"{name}.{i}.weight"], empty)
-            grads[f"{name}.{i}.weight"] += dW
-            grads[f"{name}.{i}.bias"] += db
+            if grads is not None:
+                grads[f"{name}.{i}.weight"] += dW
+                grads[f"{name}.{i}.bias"] += db
         else:
             dy = elu_backward(dy, y) if kind == "elu" else tanh_backward(dy, y)
     return dy
@@ -424,6 +432,34 @@ def clip_norm(gradient, largest):
     if length > largest:
         gradient *= gradient.dtype.type(largest / (length + 1e-6))  # PyTorch's 1e-6
     return length
+
+
+class Optimizer:
+    """Adam with clipping on a dict of arrays: all of them views of one vector, so that a step is
+    a few vector calls. Add to `grads`, then `step`, which sets them to zero again."""
+
+    def __init__(self, arrays):
+        self.vector, self.params = flatten(arrays)
+        self.gradient, self.grads = flatten({k: np.zeros_like(v) for k, v in arrays.items()})
+        self.adam = Adam(len(self.vector), self.vector.dtype)
+
+    def step(self, lr, clip):
+        """One step down the gradient, clipped to norm `clip`; returns the norm before."""
+        length = clip_norm(self.gradient, clip)
+        self.adam.step(self.vector, self.gradient, lr)
+        self.gradient[:] = 0
+        return length
+
+    def state(self):
+        """Everything that a resumed run needs."""
+        return {"weights": self.vector, "adam_m": self.adam.m, "adam_v": self.adam.v,
+                "step": np.int64(self.adam.t)}
+
+    def load(self, state):
+        """Go on from a `state`."""
+        self.vector[:], self.adam.m[:], self.adam.v[:] = (state[k] for k in
+                                                          ("weights", "adam_m", "adam_v"))
+        self.adam.t = int(state["step"])
 
 
 class Adam:
@@ -558,29 +594,15 @@ def layers(config, policy=False):
                 yield name, i, kind, (agents, before, 1), False
 
 
-# ======================================================================================
-# 4. TD-MPC's objective, Equation 1
-# ======================================================================================
-
-# Its PyTorch form, which trained the experts in data/, is `equation_1` in data/train_expert.py.
-
-
-# ======================================================================================
-# 5. Model distillation (section 4.4, Algorithm 1, Equation 4)
-# ======================================================================================
-
 HEADS = (("_reward", MLP), ("_Q1", QNET), ("_Q2", QNET))
-# A softmax doesn't see a constant, so these have no gradient but rounding errors, and Adam lets
-# them wander. Planning doesn't see a constant either.
-UNSEEN = ("_reward.4.bias", "_Q1.5.bias", "_Q2.5.bias")
 
 
-def predict(model, z, actions, tapes=None, empty=np.empty):
-    """Roll a model out under perturbed actions: global rewards and both Q at every step.
+def unroll(model, z, actions, transitions, tapes=None, empty=np.empty):
+    """Roll a model's latent out under given actions, every column on its own trajectory.
 
-    z (N, m, B), actions (L, A, B, K) -> three (L, B, K). Every noise sample follows its own
-    trajectory s_{h+1} = f_T(s_h, a_h + eps_h). Columns of x are ordered (L, B, K). A `tapes`
-    dict keeps what the backward pass needs.
+    z (N, m, B), actions (L, A, B, K): K perturbed copies of a trajectory. Returns the networks'
+    input x (N, m + d, L * B * K), columns in the order (L, B, K), with s_{h+1} = f_T(s_h, a_h),
+    and the last latents (N, m, B * K) if there are L transitions (else there are L - 1).
     """
     steps, _, batch, noise = actions.shape
     n, m, d = model.config.num_agents, model.config.latent_dim, model.config.agent_actions
@@ -588,17 +610,39 @@ def predict(model, z, actions, tapes=None, empty=np.empty):
     x = empty((n, m + d, steps * columns), z.dtype)
     x[:, m:] = actions.reshape(steps, n, d, columns).transpose(1, 2, 0, 3).reshape(n, d, -1)
     x[:, :m, :columns] = np.repeat(z, noise, axis=2)
-    keep = (lambda name: None) if tapes is None else (lambda name: tapes.setdefault(name, []))
-    for h in range(steps - 1):
-        now, after = (slice(i * columns, (i + 1) * columns) for i in (h, h + 1))
-        x[:, :m, after] = forward(MLP, model.params, "_dynamics", x[:, :, now],
-                                  keep(f"_dynamics {h}"), empty)
-    return [forward(kinds, model.params, name, x, keep(name), empty).sum(0)
+    end = None
+    for h in range(transitions):
+        end = forward(MLP, model.params, "_dynamics", x[:, :, h * columns:(h + 1) * columns],
+                      keep(tapes, f"_dynamics {h}"), empty)
+        if h < steps - 1:
+            x[:, :m, (h + 1) * columns:(h + 2) * columns] = end
+    return x, end
+
+
+def keep(tapes, name):
+    """The list in the dict `tapes` that a backward pass finds under `name`; None without tapes."""
+    return None if tapes is None else tapes.setdefault(name, [])
+
+
+def predict(model, z, actions, tapes=None, empty=np.empty):
+    """Global rewards and both Q at every step of a rollout: three (L, B, K), as in `unroll`."""
+    x, _ = unroll(model, z, actions, len(actions) - 1, tapes, empty)
+    return run_heads(model, x, actions, tapes, empty)
+
+
+def run_heads(model, x, actions, tapes=None, empty=np.empty):
+    """Global reward and both Q of `unroll`'s x: the sums over agents, three (L, B, K)."""
+    steps, _, batch, noise = actions.shape
+    return [forward(kinds, model.params, name, x, keep(tapes, name), empty).sum(0)
             .reshape(steps, batch, noise) for name, kinds in HEADS]
 
 
-def predict_backward(model, tapes, d_outputs, grads, empty=np.empty):
-    """Walk `predict` back from gradients of its three outputs; adds to `grads`, returns dz."""
+def predict_backward(model, tapes, d_outputs, grads, empty=np.empty, d_latents=None):
+    """Walk `unroll` and `run_heads` back; adds to `grads`, returns dz (N, m, B).
+
+    d_outputs: gradients of the three outputs; d_latents (L, N, m, B * K): of s_1, ..., s_L, where
+    there were L transitions.
+    """
     n, m = model.config.num_agents, model.config.latent_dim
     steps, batch, noise = d_outputs[0].shape
     columns = batch * noise
@@ -608,11 +652,138 @@ def predict_backward(model, tapes, d_outputs, grads, empty=np.empty):
         d_share = np.ascontiguousarray(np.broadcast_to(d_out.reshape(1, 1, -1),
                                                        (n, 1, steps * columns)))
         dx = dx + backward(kinds, model.params, name, tapes[name], d_share, grads, empty)
-    for h in reversed(range(steps - 1)):
-        now, after = (slice(i * columns, (i + 1) * columns) for i in (h, h + 1))
-        dx[:, :, now] += backward(MLP, model.params, "_dynamics", tapes[f"_dynamics {h}"],
-                                  np.ascontiguousarray(dx[:, :m, after]), grads, empty)
+    for h in reversed(range(steps - (d_latents is None))):
+        d_next = 0 if d_latents is None else d_latents[h]
+        if h < steps - 1:
+            d_next = d_next + dx[:, :m, (h + 1) * columns:(h + 2) * columns]
+        dx[:, :, h * columns:(h + 1) * columns] += backward(
+            MLP, model.params, "_dynamics", tapes[f"_dynamics {h}"],
+            np.ascontiguousarray(d_next), grads, empty)
     return dx[:, :m, :columns].reshape(n, m, batch, noise).sum(3)
+
+
+# ======================================================================================
+# 4. TD-MPC's objective, Equation 1
+# ======================================================================================
+
+POLICY_NOISE = 0.3  # TD-MPC's policy noise is cut here
+
+
+def td_targets(model, target, obs, reward, noise, discount):
+    """What Equation 1 holds fixed: latents of the moving-average encoder, and TD targets.
+
+    obs (H, O, B): the observation after each action; reward (H, B); noise (A, H * B): the
+    policy's. Returns (1, m, H * B), columns ordered (H, B), and the targets
+    r_h + gamma min(Q1, Q2)(s_{h+1}, pi(s_{h+1})) (H, B) with the moving averages of Q.
+    """
+    after = np.ascontiguousarray(obs.swapaxes(0, 1)).reshape(obs.shape[1], -1)
+    z = model.encode(after)
+    q = np.minimum(*target.q(z, np.clip(model.policy(z) + noise, -1, 1)))
+    return target.encode(after), reward + discount * q.reshape(reward.shape)
+
+
+def equation_1(model, obs, actions, reward, latents, td, config, grads=None, empty=np.empty):
+    """Equation 1 and, into the dict `grads`, its gradients.
+
+        1/H sum_h lambda^h [c_T |s_{h+1} - latents_h|^2 + c_R (r_h - reward_h)^2
+                            + c_Q ((Q1_h - td_h)^2 + (Q2_h - td_h)^2)],  means over B and m
+
+    obs (O, B): the first ones; actions (H, A, B); reward (H, B); latents and td from `td_targets`.
+    Returns the loss, its three sums over h without coefficients, and the rollout s_0, ..., s_H
+    (1, m, (H + 1) * B).
+    """
+    steps, _, batch = actions.shape
+    tapes, encoder_tape, actions = {}, [], actions[..., None]           # K = 1
+    z = model.encode_features(obs[None], encoder_tape, empty)
+    x, end = unroll(model, z, actions, steps, tapes, empty)
+    rollout = np.concatenate([x[:, :z.shape[1]], end], 2)
+    weights = (config.lam ** np.arange(steps) / batch).astype(z.dtype)[:, None]
+    terms, d_outputs = [], []
+    coefs = (config.reward_coef, config.value_coef, config.value_coef)
+    for coef, output, goal in zip(coefs, run_heads(model, x, actions, tapes, empty),
+                                  (reward, td, td)):
+        error = output[..., 0] - goal
+        terms.append(float((weights * error ** 2).sum()))
+        d_outputs.append((2 * coef / steps * weights * error)[..., None])
+    gap = (rollout[:, :, batch:] - latents).reshape(*z.shape[:2], steps, batch)
+    weights = weights / z.shape[1]
+    terms.insert(0, float((weights * gap ** 2).sum()))
+    terms = [terms[0], terms[1], terms[2] + terms[3]]
+    loss = np.dot(terms, [config.consistency_coef, config.reward_coef, config.value_coef]) / steps
+    if grads is not None:
+        d_latents = 2 * config.consistency_coef / steps * weights * gap
+        dz = predict_backward(model, tapes, d_outputs, grads, empty,
+                              d_latents.transpose(2, 0, 1, 3))
+        backward(ENCODER, model.params, "_encoder", encoder_tape, dz, grads, empty)
+    return float(loss), terms, rollout
+
+
+def policy_loss(model, rollout, noise, lam, grads, empty=np.empty):
+    """- sum_h lambda^h mean over B of min(Q1, Q2)(s_h, pi(s_h) + noise); gradients for `_pi` only.
+
+    rollout (1, m, L * B): the latents of `equation_1`, held fixed; noise (A, L, B). The clipping
+    of the noisy action to [-1, 1] lets gradients through, as in TD-MPC's code.
+    """
+    tape, q_tapes, (dim_action, steps, batch) = [], ([], []), noise.shape
+    mu = np.tanh(forward(MLP, model.params, "_pi", rollout, tape, empty))
+    a = np.clip(mu + noise.reshape(1, dim_action, -1), -1, 1)
+    x = np.concatenate([rollout, a], 1)
+    q1, q2 = (forward(QNET, model.params, name, x, q_tape, empty)
+              for name, q_tape in zip(("_Q1", "_Q2"), q_tapes))
+    weights = np.repeat(lam ** np.arange(steps) / batch, batch).astype(x.dtype)
+    share = np.where(q1 == q2, F32(0.5), q1 < q2).astype(x.dtype)  # a tie counts half for each
+    da = 0
+    for name, q_tape, s in (("_Q1", q_tapes[0], share), ("_Q2", q_tapes[1], 1 - share)):
+        dx = backward(QNET, model.params, name, q_tape, -weights * s, None, empty)
+        da = da + dx[:, rollout.shape[1]:]
+    backward(MLP, model.params, "_pi", tape, tanh_backward(da, mu), grads, empty)
+    return -float((weights * np.minimum(q1, q2)).sum())
+
+
+class Learner:
+    """TD-MPC: the model, its moving averages, and what an `update` of them takes."""
+
+    def __init__(self, sizes, config, rng, dtype=F32):
+        model = WorldModel.create(sizes, rng, policy=True, dtype=dtype)
+        policy = {k: v for k, v in model.params.items() if k.startswith("_pi")}
+        self.config, self.updates, self._arena = config, 0, Arena()
+        self.optimizer = Optimizer({k: v for k, v in model.params.items() if k not in policy})
+        self.policy_optimizer = Optimizer(policy)
+        self.model = WorldModel(sizes, {**self.optimizer.params, **self.policy_optimizer.params})
+        self.slow_vector, slow = flatten(self.optimizer.params)
+        self.target = WorldModel(sizes, slow)
+
+    def update(self, obs, actions, reward, std, rng):
+        """One step of Equation 1, one of the policy; every `target_every` times the averages.
+
+        obs (H + 1, O, B), actions (H, A, B), reward (H, B), std of the policy's noise. Returns
+        the three terms of Equation 1 and the latents s_0, ..., s_H (1, m, (H + 1) * B).
+        """
+        config, (steps, dim_action, batch) = self.config, actions.shape
+        self._arena.rewind()
+        noise = rng.standard_normal((dim_action, 2 * steps + 1, batch), F32)
+        noise = np.clip(noise * F32(std), -POLICY_NOISE, POLICY_NOISE)
+        latents, td = td_targets(self.model, self.target, obs[1:], reward,
+                                 noise[:, :steps].reshape(dim_action, -1), config.discount)
+        _, terms, rollout = equation_1(self.model, obs[0], actions, reward, latents, td, config,
+                                       self.optimizer.grads, self._arena.empty)
+        self.optimizer.step(config.lr, config.grad_clip)
+        policy_loss(self.model, rollout, noise[:, steps:], config.lam,
+                    self.policy_optimizer.grads, self._arena.empty)
+        self.policy_optimizer.step(config.lr, config.grad_clip)
+        self.updates += 1
+        if self.updates % config.target_every == 0:  # averages += tau (weights - averages)
+            self.slow_vector += config.tau * (self.optimizer.vector - self.slow_vector)
+        return terms, rollout
+
+
+# ======================================================================================
+# 5. Model distillation (section 4.4, Algorithm 1, Equation 4)
+# ======================================================================================
+
+# A softmax doesn't see a constant, so these have no gradient but rounding errors, and Adam lets
+# them wander. Planning doesn't see a constant either.
+UNSEEN = ("_reward.4.bias", "_Q1.5.bias", "_Q2.5.bias")
 
 
 def log_softmax(x):
@@ -691,10 +862,8 @@ class Distiller:
                                    if k.startswith("_encoder.")})
         frozen = {k: v for k, v in student.params.items() if k.startswith("_expert")}
         trained = {k: v for k, v in student.params.items() if k not in frozen}
-        self.vector, views = flatten(trained)  # all weights in a row: Adam is a few vector calls
-        self.student = WorldModel(self.model_config, {**views, **frozen})
-        self.gradient, self._grads = flatten({k: np.zeros_like(v) for k, v in trained.items()})
-        self.adam = Adam(len(self.vector))
+        self.optimizer = Optimizer(trained)
+        self.student = WorldModel(self.model_config, {**self.optimizer.params, **frozen})
         self.replay = replay
         self._teacher, self._next = ThreadPoolExecutor(1), None
         self._arenas = Arena(), Arena()  # the student's and the teacher's
@@ -723,26 +892,17 @@ class Distiller:
         """Lines 4 to 6 once. Returns loss, mean reward divergence, mean value divergence."""
         batch = (self._next or self._teacher.submit(self.batch, self.t)).result()
         self._next = self._teacher.submit(self.batch, self.t + 1)
-        self.gradient[:] = 0
         self._arenas[0].rewind()
-        losses = distill_loss(self.student, *batch, self.config, self._grads,
+        losses = distill_loss(self.student, *batch, self.config, self.optimizer.grads,
                               self._arenas[0].empty)
-        clip_norm(self.gradient, self.config.grad_clip)
-        self.adam.step(self.vector, self.gradient, self.learning_rate(self.t))
+        self.optimizer.step(self.learning_rate(self.t), self.config.grad_clip)
         self.t += 1
         return losses
 
-    def state(self):
-        """Everything that a resumed run needs besides its settings."""
-        return {"weights": self.vector, "adam_m": self.adam.m, "adam_v": self.adam.v,
-                "step": np.int64(self.t)}
-
     def load(self, state):
-        """Go on from a `state`."""
-        self.vector[:], self.adam.m[:], self.adam.v[:] = (state[k] for k in
-                                                          ("weights", "adam_m", "adam_v"))
-        self.t = self.adam.t = int(state["step"])
-        self._next = None
+        """Go on from the `state` of an optimizer."""
+        self.optimizer.load(state)
+        self.t, self._next = self.optimizer.adam.t, None
 
     def close(self):
         """Stop the teacher's thread and give BLAS its threads back."""
@@ -1750,7 +1910,7 @@ def train_student(distiller, out, settings):
                 write_curve(out / "curve.csv", curve)
                 if time.time() - saved > 30 or distiller.t == config.steps:
                     write_npz(checkpoint, {"kind": "checkpoint", "settings": settings,
-                                           "curve": curve, "seconds": seconds}, distiller.state())
+                                           "curve": curve, "seconds": seconds}, distiller.optimizer.state())
                     saved = time.time()
     return curve, before + time.time() - began
 
@@ -1840,8 +2000,8 @@ def command_distill(args):
                 "data": [checksum(expert.params.values()),
                          checksum([replay.observation, replay.action])]}
     print(f"{args.task}: {num_agents} agents of {distiller.model_config.latent_dim} latent features"
-          f", {len(distiller.vector):,} weights; replay of {replay.transitions:,} transitions; "
-          f"{config.steps:,} steps of {config.batch_size} x {config.noise_samples}; "
+          f", {len(distiller.optimizer.vector):,} weights; replay of {replay.transitions:,} "
+          f"transitions; {config.steps:,} steps of {config.batch_size} x {config.noise_samples}; "
           f"results in {out}", file=sys.stderr)
     with contextlib.closing(distiller):
         curve, seconds = train_student(distiller, out, settings)
@@ -2261,10 +2421,10 @@ def make_parser():
                      help="write the returns into the model's header, where distill finds them")
     add_config(sub, PlannerConfig)
 
-    sub = command("benchmark", command_benchmark, "Planning speed: Table 3 (the networks) and whole "
-                  "decisions, centralized and factored, by threads and processes.",
-                  epilog="Fresh weights: speed doesn't depend on what a model has learned. Keep the "
-                  "machine quiet, and read ratios.")
+    sub = command("benchmark", command_benchmark, "Planning speed: Table 3 (the networks) and "
+                  "whole decisions, centralized and factored, by threads and processes.",
+                  epilog="Fresh weights: speed doesn't depend on what a model has learned. Keep "
+                  "the machine quiet, and read ratios.")
     sub.add_argument("--robots", nargs="+", default=list(ROBOTS), metavar="ROBOT",
                      help="some of: " + ", ".join(ROBOTS) + " [all]")
     sub.add_argument("--workers", type=natural, help="processes beside this one, at most "

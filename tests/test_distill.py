@@ -59,7 +59,7 @@ def test_rank_correlation_of_the_expert_with_itself_is_one(replay):
 
 
 def test_same_seed_same_student(replay):
-    students = [distilled(replay, CONFIG, 5, seed=seed)[0].vector for seed in (1, 1, 2)]
+    students = [distilled(replay, CONFIG, 5, seed=seed)[0].optimizer.vector for seed in (1, 1, 2)]
     assert np.array_equal(students[0], students[1])
     assert not np.array_equal(students[0], students[2])
 
@@ -69,11 +69,11 @@ def test_a_resumed_run_ends_as_an_uninterrupted_one(replay):
     first, _ = distilled(replay, CONFIG, 12)
     second, _ = distilled(replay, CONFIG, 3)  # somewhere else, then put back
     second._teacher = fac.ThreadPoolExecutor(1)
-    second.load({k: np.copy(v) for k, v in first.state().items()})
+    second.load({k: np.copy(v) for k, v in first.optimizer.state().items()})
     for _ in range(8):
         second.step()
     second.close()
-    assert np.array_equal(whole.vector, second.vector)
+    assert np.array_equal(whole.optimizer.vector, second.optimizer.vector)
 
 
 @pytest.mark.parametrize("n", [1, 3])

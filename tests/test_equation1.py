@@ -1,0 +1,158 @@
+"""Equation 1 and the policy's loss: central differences, golden files, ten updates of PyTorch's."""
+import dataclasses
+import importlib.util
+
+import numpy as np
+import pytest
+
+import fac_tdmpc_ref as fac
+from test_golden import FORWARD, GRADIENT, NARROW, TASKS, assert_digest, relative
+from test_layers import assert_close, import_train_expert, numeric_gradient
+
+CONFIG = fac.ExpertConfig(latent_dim=3, enc_dim=5, mlp_dim=6, lam=0.7, batch_size=4,
+                          consistency_coef=1.5, value_coef=0.3)
+
+
+def small_learner(rng, dtype=np.float64):
+    """A learner whose every weight is alive, its moving averages apart from its model."""
+    learner = fac.Learner(fac.ModelConfig(4, 2, 1, 3, 5, 6), CONFIG, rng, dtype)
+    for vector in (learner.optimizer.vector, learner.policy_optimizer.vector, learner.slow_vector):
+        vector += 0.3 * rng.standard_normal(vector.shape).astype(dtype)
+    return learner
+
+
+def small_batch(rng, steps=3, batch=4, dtype=np.float64):
+    """obs (H + 1, O, B), actions (H, A, B), reward (H, B)."""
+    return (rng.standard_normal((steps + 1, 4, batch)).astype(dtype),
+            rng.uniform(-1, 1, (steps, 2, batch)).astype(dtype),
+            rng.standard_normal((steps, batch)).astype(dtype))
+
+
+@pytest.mark.parametrize("steps, batch", [(3, 4), (1, 1), (4, 2)])
+def test_gradients_through_the_rollout(steps, batch):
+    rng = np.random.default_rng(0)
+    learner = small_learner(rng)
+    obs, actions, reward = small_batch(rng, steps, batch)
+    latents, td = fac.td_targets(learner.model, learner.target, obs[1:], reward,
+                                 np.zeros((2, steps * batch)), 0.9)
+    case = obs[0], actions, reward, latents, td, CONFIG
+    fac.equation_1(learner.model, *case, learner.optimizer.grads)
+    for key, value in learner.optimizer.params.items():
+        expected = numeric_gradient(lambda: fac.equation_1(learner.model, *case)[0], value)
+        assert_close(learner.optimizer.grads[key], expected, 1e-5)
+        assert np.abs(expected).max() > 1e-7, f"{key}: the check compares zeros"
+
+
+def test_policy_gradient():
+    rng = np.random.default_rng(1)
+    learner = small_learner(rng)
+    rollout, noise = rng.standard_normal((1, 3, 12)), 0.01 * rng.standard_normal((2, 3, 4))
+    grads, model = learner.policy_optimizer.grads, learner.model
+    before = {k: v.copy() for k, v in learner.optimizer.grads.items()}
+    loss = fac.policy_loss(model, rollout, noise, 0.7, grads)
+    for key, value in learner.policy_optimizer.params.items():
+        expected = numeric_gradient(lambda: fac.policy_loss(
+            model, rollout, noise, 0.7, {k: np.zeros_like(v) for k, v in grads.items()}), value)
+        assert_close(grads[key], expected, 1e-5)
+        assert np.abs(expected).max() > 1e-7
+    z = rollout.reshape(1, 3, 3, 4)
+    plain = -sum(0.7 ** h * np.minimum(*model.q(z[:, :, h], model.policy(z[:, :, h])
+                                                + noise[None, :, h])).mean() for h in range(3))
+    assert np.isclose(loss, plain)
+    assert all(np.array_equal(v, before[k]) for k, v in learner.optimizer.grads.items())
+
+
+def test_clipped_policy_noise_lets_gradients_through():
+    """As TD-MPC: where mu + noise is clipped, mu's gradient is that of the clipped action's Q."""
+    rng = np.random.default_rng(2)
+    learner = small_learner(rng)
+    learner.model.params["_pi.4.bias"][:] = 3  # tanh(3) = 0.995
+    noise = np.full((2, 1, 5), 0.3)
+    fac.policy_loss(learner.model, rng.standard_normal((1, 3, 5)), noise, 1.0,
+                    learner.policy_optimizer.grads)
+    assert np.abs(learner.policy_optimizer.grads["_pi.4.bias"]).min() > 0
+
+
+def golden_case(source):
+    """(model, target, arrays, training) of a golden file."""
+    if source == "narrow":
+        header, g = fac.read_npz(NARROW, ("golden",))
+        training = header["training"]
+        sizes = fac.ModelConfig(7, 6, 1, *(training[k] for k in ("latent_dim", "enc_dim",
+                                                                 "mlp_dim")))
+        models = []
+        for prefix in ("model ", "target "):
+            params = {k[len(prefix):]: v for k, v in g.items() if k.startswith(prefix)}
+            models.append(fac.WorldModel(sizes, {
+                k: v[None, :, None] if v.ndim == 1 else v[None] for k, v in params.items()}))
+    else:
+        header, g = fac.read_npz(fac.DATA / source / "golden.npz", ("golden",))
+        training, models = header["training"], [fac.load_model(fac.DATA / source / "expert.npz")[0]
+                                                ] * 2
+    return *models, g, fac.from_dict(fac.ExpertConfig, training, source)
+
+
+@pytest.mark.parametrize("source", ["narrow", *TASKS])
+def test_golden_loss_and_gradients(source):
+    model, target, g, config = golden_case(source)
+    steps, dim_action, batch = g["action"].shape
+    latents, td = fac.td_targets(model, target, g["obs"][1:], g["rewards"],
+                                 np.zeros((dim_action, steps * batch), np.float32), config.discount)
+    grads = {k: np.zeros_like(v) for k, v in model.params.items() if not k.startswith("_pi")}
+    loss, terms, rollout = fac.equation_1(model, g["obs"][0], g["action"], g["rewards"], latents,
+                                          td, config, grads)
+    assert rollout.dtype == td.dtype == latents.dtype == np.float32
+    assert abs(loss / g["equation1_loss"] - 1) < FORWARD
+    assert relative(np.array(terms), g["equation1_terms"]) < FORWARD
+    assert relative(rollout[0, :, batch:2 * batch], g["next_latent"]) < FORWARD
+    for key, gradient in grads.items():
+        expected = g[f"equation1_grad {key}"]
+        if source == "narrow":
+            gradient = gradient[0] if key.endswith("weight") and gradient.shape[2] > 1 else \
+                gradient.reshape(expected.shape)
+            assert relative(gradient.reshape(expected.shape), expected) < GRADIENT, key
+        else:
+            assert_digest(gradient, expected, GRADIENT)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="needs PyTorch")
+@pytest.mark.parametrize("dtype, tolerance", [(np.float64, 1e-9), (np.float32, 2e-3)])
+def test_ten_updates_are_pytorch_s(dtype, tolerance):
+    """Adam divides a gradient by its own size: in float32, rounding moves small ones visibly."""
+    import torch
+    train_expert = import_train_expert()
+    rng = np.random.default_rng(3)
+    ours = small_learner(rng, dtype)
+    config = dataclasses.replace(CONFIG, grad_clip=0.5, tau=0.1)
+    ours.config = config
+    theirs = train_expert.Learner(4, 2, config, "cpu")
+    for network, model in ((theirs.model, ours.model), (theirs.target, ours.target)):
+        network.to(getattr(torch, np.dtype(dtype).name))
+        params = dict(network.named_parameters())
+        with torch.no_grad():
+            for key, value in model.params.items():
+                params[key].copy_(torch.tensor(value).reshape(params[key].shape))
+    # the moving average has a policy of its own in PyTorch's form, which nothing reads
+    for t in range(10):
+        obs, actions, reward = small_batch(np.random.default_rng(t), dtype=dtype)
+        found, _ = ours.update(obs, actions, reward, 0.0, rng)
+        expected = theirs.update(*(torch.tensor(np.ascontiguousarray(x.swapaxes(-1, -2)))
+                                   if x.ndim == 3 else torch.tensor(x)
+                                   for x in (obs, actions, reward)), 0.0)
+        assert_close(np.array(found), np.array([x.item() for x in expected]), 10 * tolerance)
+    for model, network in ((ours.model, theirs.model), (ours.target, theirs.target)):
+        params = dict(network.named_parameters())
+        for key, value in model.params.items():
+            assert_close(value.ravel(), params[key].detach().numpy().ravel(), tolerance)
+
+
+def test_the_averages_follow_every_second_update():
+    rng = np.random.default_rng(4)
+    learner = small_learner(rng, np.float32)
+    batch = small_batch(rng, dtype=np.float32)
+    slow = learner.slow_vector.copy()
+    learner.update(*batch, 0.1, rng)
+    assert np.array_equal(learner.slow_vector, slow)
+    learner.update(*batch, 0.1, rng)
+    assert np.allclose(learner.slow_vector, slow + 0.01 * (learner.optimizer.vector - slow))
+    assert learner.slow_vector.dtype == learner.optimizer.vector.dtype == np.float32
