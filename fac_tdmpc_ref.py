@@ -201,7 +201,7 @@ class DistillConfig:
 
 @dataclass(frozen=True)
 class ExpertConfig:
-    """TD-MPC's training (Equation 1), used by data/train_expert.py."""
+    """TD-MPC's training (Equation 1), here and in data/train_expert.py."""
     latent_dim: int = field(50, "m: latent features (Table 2)")
     enc_dim: int = field(256, "hidden width of the encoder (Table 2)")
     mlp_dim: int = field(512, "hidden width of the other networks (Table 2)")
@@ -221,6 +221,22 @@ class ExpertConfig:
     std_steps: int = field(25_000, "decisions over which it falls to the planner's min_std")
     seed_decisions: int = field(4_000, "random decisions before the first update")
     buffer_size: int = field(1_000_000, "replay capacity, transitions (Table 2)")
+    buffer_dtype: str = field("float32", "how the replay is kept in memory",
+                              choices=("float32", "float16"))
+
+    def __post_init__(self):
+        for name in ("latent_dim", "enc_dim", "mlp_dim", "horizon", "batch_size", "target_every",
+                     "buffer_size"):
+            if getattr(self, name) < 1:
+                raise UserError(f"training: {name} must be at least 1, not {getattr(self, name)}")
+        for name in ("updates_per_step", "discount", "lam", "consistency_coef", "reward_coef",
+                     "value_coef", "tau", "std_start", "std_steps", "seed_decisions"):
+            if not getattr(self, name) >= 0:
+                raise UserError(f"training: {name} must be at least 0, not {getattr(self, name)}")
+        if not (self.lr > 0 and self.grad_clip > 0):
+            raise UserError(f"training: lr and grad_clip must be above 0, not {self.lr} and "
+                            f"{self.grad_clip}")
+        check_choices(self)
 
 
 def divisors(n):
@@ -838,6 +854,28 @@ def distill_loss(student, features, actions, targets, config, grads=None, empty=
     return loss, means[0], (means[1] + means[2]) / 2
 
 
+def new_student(expert, num_agents, config, seed):
+    """A fresh student of an expert, and the optimizer that holds its trained weights.
+
+    Where the student reads the expert's latent, it shares the expert's own encoder arrays [D3].
+    """
+    sizes = student_config(expert.config, num_agents, config.sizes, config.encoder_input)
+    student = WorldModel.create(sizes, np.random.default_rng([seed, 2 ** 32 - 1]))
+    frozen = {"_expert" + k: v for k, v in expert.params.items()
+              if k.startswith("_encoder.") and config.encoder_input == "latent"}
+    optimizer = Optimizer({k: v for k, v in student.params.items()
+                           if not k.startswith("_expert")})
+    return optimizer, WorldModel(sizes, {**optimizer.params, **frozen})
+
+
+def learning_rate(config, t):
+    """Linear rise over `warmup` steps, then constant or half a cosine down to zero [D1]."""
+    rate = config.lr * min(1.0, (t + 1) / max(1, config.warmup))
+    if config.lr_schedule == "cosine":
+        rate *= 0.5 * (1 + np.cos(np.pi * min(1.0, t / config.steps)))
+    return float(rate)
+
+
 class Distiller:
     """Algorithm 1: one `step` after the other, reproducible from (seed, step) alone.
 
@@ -854,16 +892,8 @@ class Distiller:
                             f"{sizes.dim_action}); pass the replay of the expert's task")
         self.expert, self.config, self.seed, self.t = expert, config, seed, 0
         agents = sizes.dim_action if num_agents is None else num_agents
-        self.model_config = student_config(sizes, agents, config.sizes, config.encoder_input)
         self._threads = one_thread()  # until `close`, in this thread and the teacher's
-        student = WorldModel.create(self.model_config, np.random.default_rng([seed, 2 ** 32 - 1]))
-        if config.encoder_input == "latent":
-            student.params.update({"_expert" + k: v for k, v in expert.params.items()
-                                   if k.startswith("_encoder.")})
-        frozen = {k: v for k, v in student.params.items() if k.startswith("_expert")}
-        trained = {k: v for k, v in student.params.items() if k not in frozen}
-        self.optimizer = Optimizer(trained)
-        self.student = WorldModel(self.model_config, {**self.optimizer.params, **frozen})
+        self.optimizer, self.student = new_student(expert, agents, config, seed)
         self.replay = replay
         self._teacher, self._next = ThreadPoolExecutor(1), None
         self._arenas = Arena(), Arena()  # the student's and the teacher's
@@ -881,13 +911,6 @@ class Distiller:
         return perturbed_batch(self.expert, self.student, obs, actions, self.config, rng,
                                self._arenas[1].empty)
 
-    def learning_rate(self, t):
-        """Linear rise over `warmup` steps, then constant or half a cosine down to zero [D1]."""
-        rate = self.config.lr * min(1.0, (t + 1) / max(1, self.config.warmup))
-        if self.config.lr_schedule == "cosine":
-            rate *= 0.5 * (1 + np.cos(np.pi * min(1.0, t / self.config.steps)))
-        return float(rate)
-
     def step(self):
         """Lines 4 to 6 once. Returns loss, mean reward divergence, mean value divergence."""
         batch = (self._next or self._teacher.submit(self.batch, self.t)).result()
@@ -895,7 +918,7 @@ class Distiller:
         self._arenas[0].rewind()
         losses = distill_loss(self.student, *batch, self.config, self.optimizer.grads,
                               self._arenas[0].empty)
-        self.optimizer.step(self.learning_rate(self.t), self.config.grad_clip)
+        self.optimizer.step(learning_rate(self.config, self.t), self.config.grad_clip)
         self.t += 1
         return losses
 
@@ -1746,6 +1769,59 @@ class Replay:
         return obs, actions.swapaxes(1, 2).astype(F32)
 
 
+class ReplayBuffer:
+    """Whole episodes in fixed memory, to train an expert on; the oldest go when it is full.
+
+    observation (E, T + 1, O), action (E, T, A), reward (E, T) with T = EPISODE_STEPS; capacity in
+    transitions; `count` episodes have been added so far.
+    """
+
+    def __init__(self, dim_obs, dim_action, capacity, dtype=F32):
+        episodes, self.count = max(1, capacity // EPISODE_STEPS), 0
+        self.observation = np.zeros((episodes, EPISODE_STEPS + 1, dim_obs), dtype)
+        self.action = np.zeros((episodes, EPISODE_STEPS, dim_action), dtype)
+        self.reward = np.zeros((episodes, EPISODE_STEPS), F32)
+
+    def __len__(self):
+        """Episodes held."""
+        return min(self.count, len(self.reward))
+
+    def add(self, observation, action, reward):
+        """Add an episode: (T + 1, O), (T, A), (T,)."""
+        i = self.count % len(self.reward)
+        self.observation[i], self.action[i], self.reward[i] = observation, action, reward
+        self.count += 1
+
+    def sample(self, rng, batch, steps, task):
+        """Segments drawn evenly, half of reacher's with a hindsight target [D6], float32.
+
+        Returns observations (H + 1, O, B), actions (H, A, B) and rewards (H, B).
+        """
+        episode = rng.integers(len(self), size=batch)
+        start = rng.integers(EPISODE_STEPS - steps + 1, size=batch)
+        rows = start + np.arange(steps + 1)[:, None]
+        obs = self.observation[episode, rows].astype(F32)
+        action = self.action[episode, rows[:-1]].astype(F32)
+        reward = self.reward[episode, rows[:-1]]
+        if task.startswith("reacher"):
+            later = self.observation[episode, rng.integers(start + 1, EPISODE_STEPS + 1)]
+            hindsight(obs, reward, later.astype(F32), rng.random(batch) < 0.5, task)
+        return obs.swapaxes(1, 2), action.swapaxes(1, 2), reward
+
+    def write(self, path, header):
+        """A file for `Replay`: oldest episode first; an episode's last row has no action."""
+        order = np.arange(self.count - len(self), self.count) % len(self.reward)
+        action = np.zeros((len(order), EPISODE_STEPS + 1, self.action.shape[2]), np.float16)
+        action[:, :-1] = self.action[order]
+        continues = np.ones(action.shape[:2], bool)
+        continues[:, -1] = False
+        write_npz(path, {"kind": "replay", **header}, {
+            "observation": self.observation[order].reshape(-1, self.observation.shape[2])
+            .astype(np.float16),
+            "action": action.reshape(-1, action.shape[2]), "continues": continues.ravel()},
+            compress=True)
+
+
 def checksum(arrays):
     """CRC of the arrays' bytes: tells experts and replays of the same sizes apart."""
     return functools.reduce(lambda crc, a: zlib.crc32(np.ascontiguousarray(a), crc), arrays, 0)
@@ -1882,13 +1958,7 @@ def train_student(distiller, out, settings):
     curve, before = [], 0.0
     if checkpoint.exists():
         header, arrays = read_npz(checkpoint, ("checkpoint",))
-        theirs, ours = ({**s, **s["distill"], "distill": None}
-                        for s in (header["settings"], settings))
-        for key, value in ours.items():
-            if theirs.get(key) != value:
-                raise UserError(f"{checkpoint}: an unfinished run with other settings ({key}: "
-                                f"expected {value}, found {theirs.get(key)}); finish it with its "
-                                f"own, delete it, or choose another --out")
+        same_settings(header["settings"], settings, checkpoint)
         curve, before = header["curve"], header["seconds"]
         distiller.load(arrays)
     began = saved = time.time()
@@ -1896,7 +1966,7 @@ def train_student(distiller, out, settings):
     losses = []
     with progress("distilling", config.steps, "step", distiller.t) as bar:
         while distiller.t < config.steps:
-            rate = distiller.learning_rate(distiller.t)
+            rate = learning_rate(config, distiller.t)
             losses.append(distiller.step())
             bar.update()
             if distiller.t % every == 0 or distiller.t == config.steps:
@@ -1907,20 +1977,35 @@ def train_student(distiller, out, settings):
                               float(kl_value), rate, float(rank[0]), float(rank[-1])])
                 bar.set_postfix_str(f"loss {loss:.4f} KL reward {kl_reward:.4f} value "
                                     f"{kl_value:.4f} rank {rank[0]:.3f}", False)
-                write_curve(out / "curve.csv", curve)
+                write_curve(out / "curve.csv", CURVE, curve)
                 if time.time() - saved > 30 or distiller.t == config.steps:
                     write_npz(checkpoint, {"kind": "checkpoint", "settings": settings,
-                                           "curve": curve, "seconds": seconds}, distiller.optimizer.state())
+                                           "curve": curve, "seconds": seconds},
+                              distiller.optimizer.state())
                     saved = time.time()
     return curve, before + time.time() - began
 
 
-def write_curve(path, curve):
-    """The learning curve as CSV."""
+def same_settings(found, expected, where):
+    """UserError if a checkpoint was made with other settings (dicts, one level deep)."""
+    def flat(settings):
+        return {(group, key): value for group, part in settings.items()
+                for key, value in (part if isinstance(part, dict) else {group: part}).items()}
+
+    found, expected = flat(found), flat(expected)
+    for key in {**found, **expected}:
+        if found.get(key) != expected.get(key):
+            raise UserError(f"{where}: an unfinished run with other settings ({key[1]}: expected "
+                            f"{expected.get(key)}, found {found.get(key)}); finish it with its "
+                            f"own, delete it, or choose another --out")
+
+
+def write_curve(path, columns, rows):
+    """A learning curve as CSV."""
     with atomic_file(path, "w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(CURVE)
-        writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in row] for row in curve)
+        writer.writerow(columns)
+        writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in row] for row in rows)
 
 
 def pyplot():
@@ -1963,6 +2048,12 @@ def draw_curve(path, curve, title):
     return True
 
 
+def evaluation_record(found, config, seed):
+    """What a model's header keeps of an `evaluate`; `recorded_returns` reads it."""
+    return {"returns": found["returns"], "seeds": found["seeds"], "seed": seed,
+            "planner": dataclasses.asdict(config)}
+
+
 def recorded_returns(header, config, seeds):
     """The expert's recorded returns for these episodes and this planner, or None."""
     record = header.get("evaluation") or {}
@@ -1979,6 +2070,9 @@ def command_distill(args):
     lookup_task(args.task)
     if args.episodes < 1:
         raise UserError(f"episodes must be at least 1, not {args.episodes}")
+    if args.expert and Path(args.expert).is_dir():  # as `train` and data/TASK hold them
+        args.replay = args.replay or Path(args.expert) / "replay.npz"
+        args.expert = Path(args.expert) / "expert.npz"
     expert_path = args.expert or data_file(args.task, "expert.npz")
     expert, header = load_model(expert_path)
     for key, expected in (("kind", "expert"), ("task", args.task)):
@@ -1992,17 +2086,17 @@ def command_distill(args):
     except OSError as error:
         raise UserError(f"{out}: can't be written: {error.strerror}") from None
     distiller = Distiller(expert, replay, config, args.num_agents, args.seed)
-    num_agents = distiller.model_config.num_agents
+    num_agents = distiller.student.config.num_agents
     beside = useful_workers(num_agents) if args.plan_workers is None else args.plan_workers
     shares(num_agents, beside)  # refuses too many
     settings = {"task": args.task, "seed": args.seed, "num_agents": num_agents,
                 "distill": dataclasses.asdict(config),
                 "data": [checksum(expert.params.values()),
                          checksum([replay.observation, replay.action])]}
-    print(f"{args.task}: {num_agents} agents of {distiller.model_config.latent_dim} latent features"
-          f", {len(distiller.optimizer.vector):,} weights; replay of {replay.transitions:,} "
-          f"transitions; {config.steps:,} steps of {config.batch_size} x {config.noise_samples}; "
-          f"results in {out}", file=sys.stderr)
+    print(f"{args.task}: {num_agents} agents of {distiller.student.config.latent_dim} latent "
+          f"features, {len(distiller.optimizer.vector):,} weights; replay of "
+          f"{replay.transitions:,} transitions; {config.steps:,} steps of {config.batch_size} x "
+          f"{config.noise_samples}; results in {out}", file=sys.stderr)
     with contextlib.closing(distiller):
         curve, seconds = train_student(distiller, out, settings)
         rank = rank_correlation(distiller, 256, args.seed)
@@ -2070,6 +2164,332 @@ def print_table(rows):
                         for i, (cell, w) in enumerate(zip(row, widths))))
 
 
+def explore(environment, planner, seed, std):
+    """One training episode: observations (T + 1, O), actions (T, A), rewards (T,).
+
+    The planner's actions with Gaussian noise of deviation `std` added, as TD-MPC explores; without
+    a planner, actions drawn evenly. Depends on the planner's model and the seed alone.
+    """
+    rng = np.random.default_rng([seed, 1])
+    observation, action, reward = [environment.reset(seed)], [], []
+    if planner:
+        planner.reset(seed)
+    for _ in range(EPISODE_STEPS):
+        if planner:
+            a = planner.act(observation[-1])
+            a = np.clip(a + std * rng.standard_normal(a.shape, F32), -1, 1)
+        else:
+            a = rng.uniform(-1, 1, environment.dim_action).astype(F32)
+        obs, r = environment.step(a)
+        observation.append(obs)
+        action.append(a)
+        reward.append(r)
+    return np.stack(observation), np.stack(action), np.array(reward, F32)
+
+
+def _acting_worker(connection):
+    environment = Environment(connection.recv())
+    while True:
+        models, jobs = connection.recv()
+        planners = {name: Planner(WorldModel(*model), config)
+                    for name, (*model, config) in models.items()}
+        for name, seed, std in jobs:
+            connection.send(explore(environment, planners.get(name), seed, std))
+
+
+class Actors:
+    """Processes that act out episodes while this one learns."""
+
+    def __init__(self, task, workers):
+        lookup_task(task)
+        self._workers, self._count = Workers(_acting_worker, workers, "acting worker"), workers
+        self._workers.send_all(task)
+
+    def start(self, models, jobs):
+        """models: {name: (model, planner config)}; jobs: (name, or None for random; seed; std)."""
+        self._jobs = len(jobs)
+        models = {name: (model.config, model.params, config)
+                  for name, (model, config) in models.items()}
+        for i in range(self._count):
+            self._workers.send(i, (models, jobs[i::self._count]))
+
+    def collect(self):
+        """What `explore` gave for every job, in their order."""
+        return [self._workers.receive(i % self._count) for i in range(self._jobs)]
+
+    def close(self):
+        """End the processes."""
+        self._workers.close()
+
+
+class OnlineStudent:
+    """Appendix C.1: Algorithm 1 on the batches, and with the expert, of a training that goes on."""
+
+    def __init__(self, expert, num_agents, config, seed):
+        self.expert, self.config, self.seed, self._arena = expert, config, seed, Arena()
+        self.optimizer, self.model = new_student(expert, num_agents, config, seed)
+
+    def update(self, obs, actions):
+        """One step of Algorithm 1 on observations (O, B) and actions (H, A, B); its losses."""
+        config, t = self.config, self.optimizer.adam.t
+        self._arena.rewind()
+        batch = perturbed_batch(self.expert, self.model, obs,
+                                actions[:config.horizon + config.final_term], config,
+                                np.random.default_rng([self.seed, t]), self._arena.empty)
+        losses = distill_loss(self.model, *batch, config, self.optimizer.grads, self._arena.empty)
+        self.optimizer.step(learning_rate(config, t), config.grad_clip)
+        return losses
+
+
+TRAINING_BUDGET = {"samples": 128, "iterations": 4, "horizon": 3}
+TRAINING_CURVE = ("decisions", "updates", "seconds", "std", "horizon", "return_mean", "return_min",
+                  "return_max", "consistency", "reward", "value", "kl_reward", "kl_value",
+                  "eval_expert", "eval_student")
+
+
+class Training:
+    """An expert that learns (Equation 1), the student that may follow it, and their replay.
+
+    Rounds: while the actors play `envs` episodes with the weights of the round's start, the
+    learner makes the updates that the decisions so far allow. Everything depends on the seed, not
+    on the number of workers, and all of it is in `state`.
+    """
+
+    def __init__(self, args, config, planning, distilling):
+        _, _, dim_obs, dim_action = lookup_task(args.task)
+        self.args, self.config, self.planning = args, config, planning
+        sizes = ModelConfig(dim_obs, dim_action, 1, config.latent_dim, config.enc_dim,
+                            config.mlp_dim)
+        self.learner = Learner(sizes, config, np.random.default_rng([args.seed, 0]))
+        self.student = distilling and OnlineStudent(self.learner.model, args.num_agents,
+                                                    distilling, args.seed)
+        self.buffer = ReplayBuffer(dim_obs, dim_action, config.buffer_size,
+                                   np.dtype(config.buffer_dtype))
+        self.decisions, self.seconds, self.curve = 0, 0.0, []
+        self.settings = {
+            "task": args.task, "seed": args.seed, "envs": args.envs, "steps": args.steps,
+            "evaluate_every": args.evaluate_every, "config": dataclasses.asdict(config),
+            "planner": dataclasses.asdict(planning), "num_agents": args.num_agents,
+            "distill": distilling and dataclasses.asdict(distilling)}
+
+    @property
+    def updates(self):
+        return self.learner.updates
+
+    def learn(self):
+        """One update of the expert and, on the same batch, one of the student."""
+        rng = np.random.default_rng([self.args.seed, 1, self.updates])
+        obs, actions, reward = self.buffer.sample(rng, self.config.batch_size, self.config.horizon,
+                                                  self.args.task)
+        terms, _ = self.learner.update(obs, actions, reward, self.std, rng)
+        kl = self.student.update(obs[0], actions)[1:] if self.student else (0.0, 0.0)
+        return *terms, *kl
+
+    def learn_until(self, updates, bar):
+        """Updates until there were so many; returns their losses."""
+        losses = []
+        while self.updates < updates:
+            losses.append(self.learn())
+            bar.update()
+        return losses
+
+    @property
+    def std(self):
+        """Smallest sampling deviation: falls from std_start over the first decisions (TD-MPC)."""
+        return float(np.interp(self.decisions, [0, self.config.std_steps],
+                               [self.config.std_start, self.planning.min_std]))
+
+    def round(self, actors, bar):
+        """Episodes and the updates they allow, side by side; adds a row to the curve."""
+        args, config, began = self.args, self.config, time.time()
+        quota = args.envs * EPISODE_STEPS
+        horizon = int(np.interp(self.decisions, [0, config.std_steps], [1, self.planning.horizon]))
+        first, std = self.decisions // EPISODE_STEPS, self.std
+        warming = self.decisions < config.seed_decisions
+        due = 0 if warming else int(config.updates_per_step * self.decisions)
+        # the random episodes' updates come before the first planned episode
+        losses = self.learn_until(due - int(config.updates_per_step * quota), bar)
+        jobs = [(None if warming else "explore", int(np.random.default_rng(
+            [args.seed, 2, first + i]).integers(2 ** 31)), std) for i in range(args.envs)]
+        models = {"explore": (self.learner.model, dataclasses.replace(
+            self.planning, min_std=std, horizon=horizon))}
+        tested = {}
+        if not warming and self.decisions % args.evaluate_every < quota:
+            tested = {"expert": self.learner.model}
+            if self.student:
+                tested["student"] = self.student.model
+            models.update({name: (model, self.planning) for name, model in tested.items()})
+            jobs += [(name, seed, 0.0) for name in tested
+                     for seed in episode_seeds(args.seed + 1, args.evaluate_episodes)]
+        actors.start(models, jobs)
+        losses += self.learn_until(due, bar)
+        episodes = actors.collect()
+        returns = [float(reward.sum()) for *_, reward in episodes]
+        for episode in episodes[:args.envs]:
+            self.buffer.add(*episode)
+        self.decisions += quota
+        self.seconds += time.time() - began
+        played, tests = returns[:args.envs], [None, None]
+        if tested:
+            means = np.reshape(returns[args.envs:], (len(tested), -1)).mean(1)
+            tests[:len(tested)] = means.tolist()
+        self.curve.append([self.decisions, self.updates, round(self.seconds, 1), std, horizon,
+                           float(np.mean(played)), min(played), max(played),
+                           *(np.mean(losses, 0).tolist() if losses else [None] * 5), *tests])
+        bar.set_postfix_str(f"{self.decisions:,} decisions, return {np.mean(played):.0f}" + "".join(
+            f", {name} {r:.0f}" for name, r in zip(tested, tests)), False)
+
+    def state(self):
+        """(header, arrays) that a resumed run needs; `load` takes them back."""
+        parts = {"expert": self.learner.optimizer, "policy": self.learner.policy_optimizer}
+        if self.student:
+            parts["student"] = self.student.optimizer
+        arrays = {f"{name} {k}": v for name, part in parts.items() for k, v in part.state().items()}
+        kept = len(self.buffer)
+        arrays.update(slow=self.learner.slow_vector, count=np.int64(self.buffer.count),
+                      observation=self.buffer.observation[:kept],
+                      action=self.buffer.action[:kept], reward=self.buffer.reward[:kept])
+        return {"kind": "checkpoint", "settings": self.settings, "decisions": self.decisions,
+                "updates": self.updates, "seconds": self.seconds, "curve": self.curve}, arrays
+
+    def load(self, header, arrays, where):
+        """Go on from a `state`; UserError if it is another run's."""
+        same_settings(header["settings"], self.settings, where)
+        parts = {"expert": self.learner.optimizer, "policy": self.learner.policy_optimizer}
+        if self.student:
+            parts["student"] = self.student.optimizer
+        for name, part in parts.items():
+            part.load({k[len(name) + 1:]: v for k, v in arrays.items() if k.startswith(name + " ")})
+        for key in ("slow", "count", "observation", "action", "reward"):
+            if key not in arrays:
+                raise UserError(f"{where}: {key}: missing; delete the file to start anew")
+        self.learner.slow_vector[:] = arrays["slow"]
+        kept = len(arrays["reward"])
+        self.buffer.count = int(arrays["count"])
+        self.buffer.observation[:kept], self.buffer.action[:kept], self.buffer.reward[:kept] = (
+            arrays[k] for k in ("observation", "action", "reward"))
+        self.decisions, self.seconds, self.curve = (header[k] for k in ("decisions", "seconds",
+                                                                        "curve"))
+        self.learner.updates = header["updates"]
+
+
+def lag(curve, fraction):
+    """Decisions from the expert's reaching a fraction of its last evaluation to the student's.
+
+    None where the student never got there.
+    """
+    tests = [(row[0], row[-2], row[-1]) for row in curve if row[-1] is not None]
+    if not tests or not tests[-1][1] > 0:
+        return None
+    goal = fraction * tests[-1][1]
+    reached = [next((t[0] for t in tests if t[i] >= goal), None) for i in (1, 2)]
+    return None if None in reached else reached[1] - reached[0]
+
+
+def command_train(args):
+    """train: an expert (Equation 1) and, with --student fac, a student that follows it (C.1)."""
+    config, planning, distilling = args.configs
+    _, _, _, dim_action = lookup_task(args.task)
+    quota = args.envs * EPISODE_STEPS
+    for name in ("envs", "workers", "evaluate_every", "evaluate_episodes"):
+        if getattr(args, name) < 1:
+            raise UserError(f"{name} must be at least 1, not {getattr(args, name)}")
+    if args.steps < quota:
+        raise UserError(f"{args.envs} environments need at least {quota} steps, not {args.steps}")
+    if not args.student:
+        distilling = None
+    else:
+        args.num_agents = args.num_agents or dim_action
+        total = max(1, int(config.updates_per_step * (args.steps // quota * quota)))
+        distilling = dataclasses.replace(distilling, steps=total)
+        if distilling.horizon + distilling.final_term > config.horizon:
+            raise UserError(f"the student looks {distilling.horizon + distilling.final_term} steps "
+                            f"ahead, the expert's batches hold {config.horizon}; lower "
+                            f"--distill-horizon or raise --horizon")
+    out = Path(args.out or f"runs/train-{args.task}-{args.seed}")
+    training, checkpoint = Training(args, config, planning, distilling), out / "checkpoint.npz"
+    if checkpoint.exists():
+        training.load(*read_npz(checkpoint, ("checkpoint",)), checkpoint)
+    elif args.resume:
+        raise UserError(f"{checkpoint}: no such file; there is nothing to resume")
+    began = saved = time.time()
+    total = int(config.updates_per_step * (args.steps // quota * quota))
+    with contextlib.closing(Actors(args.task, min(args.workers, args.envs))) as actors, \
+            one_thread(), progress("training", total, "update", training.updates) as bar:
+        while training.decisions + quota <= args.steps:
+            if args.minutes and time.time() - began > 60 * args.minutes:
+                break
+            training.round(actors, bar)
+            write_curve(out / "curve.csv", TRAINING_CURVE, training.curve)
+            if time.time() - saved > 60 or training.decisions + quota > args.steps:
+                write_npz(checkpoint, *training.state())
+                saved = time.time()
+        done = training.decisions + quota > args.steps
+        if done:
+            training.learn_until(total, bar)
+        write_npz(checkpoint, *training.state())
+    result = {"task": args.task, "seed": args.seed, "steps": training.decisions,
+              "updates": training.updates, "seconds": round(training.seconds, 1), "done": done,
+              "out": str(out)}
+    if not done:
+        print(f"stopped after {training.decisions:,} decisions; the same command goes on from "
+              f"{checkpoint}", file=sys.stderr)
+        return result
+    about = {"task": args.task, "seed": args.seed, "decisions": training.decisions,
+             "updates": training.updates, "minutes": round(training.seconds / 60, 1),
+             "training": dataclasses.asdict(config),
+             "training_planner": dataclasses.asdict(planning)}
+    training.buffer.write(out / "replay.npz", about)
+    models = {"expert": training.learner.model}
+    if training.student:
+        models["student"] = training.student.model
+    rows = [("", "return", "ms a decision")]
+    for kind, model in models.items():
+        header, prefix = {"kind": kind, **about}, "" if kind == "expert" else "student_"
+        if args.episodes:
+            found = evaluate(model, args.task, PlannerConfig(), args.episodes, 0, None,
+                             f"evaluating the {kind}")
+            returns = found["returns"]
+            header["evaluation"] = evaluation_record(found, PlannerConfig(), 0)
+            result.update({prefix + "return_mean": float(np.mean(returns)), prefix + "returns":
+                           returns, prefix + "return_std": float(np.std(returns))})
+            rows.append((kind, f"{np.mean(returns):.0f} ± {np.std(returns):.0f}",
+                         f"{found['plan_ms_median']:.1f}"))
+        save_model(out / f"{kind}.npz", model, header)
+    if training.student:
+        if args.episodes:
+            result["ratio"] = result["student_return_mean"] / max(result["return_mean"], 1e-9)
+        result["lag"] = {str(p): lag(training.curve, p / 100) for p in (50, 75, 90)}
+    drawn = draw_training(out / "curve.png", training.curve, f"{args.task}, seed {args.seed}")
+    checkpoint.unlink()
+    print(f"\n{args.task}: {training.decisions:,} decisions, {training.updates:,} updates, "
+          f"{training.seconds / 60:.1f} minutes; {args.episodes} evaluation episodes\n")
+    print_table(rows)
+    print(f"\n{out}/" + ("" if drawn else
+                         "\n(no picture: pip install 'fac-tdmpc-ref[plots]' draws curve.png)"))
+    return result
+
+
+def draw_training(path, curve, title):
+    """Returns over the decisions; False where matplotlib is missing."""
+    try:
+        plt = pyplot()
+    except UserError:
+        return False
+    columns = dict(zip(TRAINING_CURVE, zip(*curve)))
+    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
+    axes.plot(columns["decisions"], columns["return_mean"], alpha=0.5, label="training episodes")
+    for key, label in (("eval_expert", "expert"), ("eval_student", "student")):
+        points = [(x, y) for x, y in zip(columns["decisions"], columns[key]) if y is not None]
+        if points:
+            axes.plot(*zip(*points), marker="o", label=label)
+    axes.set(xlabel="decisions (two environment steps each)", ylabel="return", title=title)
+    axes.legend()
+    axes.grid(alpha=0.3)
+    save_figure(path, figure)
+    return True
+
+
 def command_evaluate(args):
     """evaluate: a model's returns on a task."""
     (planning,) = args.configs
@@ -2084,8 +2504,7 @@ def command_evaluate(args):
               "returns": returns, "plan_ms_median": found["plan_ms_median"],
               "episodes": args.episodes, "task": task, "seed": args.seed}
     if args.record:
-        header["evaluation"] = {"returns": returns, "seeds": found["seeds"], "seed": args.seed,
-                                "planner": dataclasses.asdict(planning)}
+        header["evaluation"] = evaluation_record(found, planning, args.seed)
         save_model(args.model, model, header)
     print_table([("task", "episodes", "return", "min", "max", "ms a decision"),
                  (task, str(args.episodes), f"{np.mean(returns):.0f} ± {np.std(returns):.0f}",
@@ -2296,7 +2715,7 @@ def print_benchmark(result, robots):
           f"one thread / processes / one agent alone (paper: N threads)\n")
     print_table([("", "", *(m if mode == "one-thread" else mode for m, mode in columns), "x",
                   "paper's x")] + [
-        (robot, f, *(times[robot, f, *column] for column in columns),
+        (robot, f, *(times[(robot, f, *column)] for column in columns),
          " / ".join(f"{ratio[robot, f, mode]['value']:.1f}" for mode in MODES),
          f"{ratio[robot, f, 'one-thread']['paper']:.1f}") for robot in robots for f in FUNCTIONS])
     print("\nOne decision, ms, median (times the GEMM floor)\n")
@@ -2394,7 +2813,8 @@ def make_parser():
     sub.add_argument("--num-agents", type=int, help="N, a divisor of dim(A) [dim(A)]")
     sub.add_argument("--preset", choices=("default", "paper"), default="default",
                      help="paper: Algorithm 1 with Table 2 to the letter (days on a laptop)")
-    sub.add_argument("--expert", help="expert file [data/TASK/expert.npz]")
+    sub.add_argument("--expert", help="expert file, or a folder with expert.npz and replay.npz "
+                     "[data/TASK]")
     sub.add_argument("--replay", help="replay file [data/TASK/replay.npz]")
     sub.add_argument("--out", help="folder for the results [runs/TASK-SEED]")
     sub.add_argument("--episodes", type=int, default=20, help="evaluation episodes [20]")
@@ -2408,6 +2828,35 @@ def make_parser():
                      help="measure the expert's return anew instead of reading its record")
     add_config(sub, DistillConfig)
     add_config(sub, PlannerConfig, prefix="plan-")
+
+    sub = command("train", command_train, "Train an expert in NumPy (Equation 1); with --student "
+                  "fac, distil it on the way (appendix C.1).",
+                  epilog="A run that was cut off goes on when the same command is given again. Its "
+                  "folder is what distill takes as --expert.")
+    sub.add_argument("--task", default="reacher-easy", help="one of: " + ", ".join(TASKS))
+    sub.add_argument("--steps", type=natural, default=50_000,
+                     help="decisions, two environment steps each [50000]")
+    sub.add_argument("--seed", type=natural, default=0, help="[0]")
+    sub.add_argument("--student", choices=("fac",), help="fac: after each update of the expert, "
+                     "one of a factored student on the same batch")
+    sub.add_argument("--num-agents", type=int, help="the student's N [dim(A)]")
+    sub.add_argument("--envs", type=natural, default=4, help="episodes in a round, all with the "
+                     "weights of its start [4]")
+    sub.add_argument("--workers", type=natural, default=max(1, (os.cpu_count() or 1) - 1),
+                     help="processes that play them while this one learns [cores - 1]")
+    sub.add_argument("--minutes", type=float, default=0, help="stop after the round under way by "
+                     "then; 0: never [0]")
+    sub.add_argument("--resume", action="store_true", help="insist on a checkpoint in --out")
+    sub.add_argument("--out", help="folder for the results [runs/train-TASK-SEED]")
+    sub.add_argument("--episodes", type=natural, default=20, help="evaluation episodes at the end, "
+                     "with MPPI's default budget; 0: none [20]")
+    sub.add_argument("--evaluate-every", type=natural, default=4_000, help="decisions between two "
+                     "evaluations on the way [4000]")
+    sub.add_argument("--evaluate-episodes", type=natural, default=4, help="episodes in one [4]")
+    add_config(sub, ExpertConfig, batch_size=256, updates_per_step=0.5)
+    add_config(sub, PlannerConfig, "MPPI while training", "plan-", **TRAINING_BUDGET)
+    add_config(sub, DistillConfig, "The student (Algorithm 1); its steps are the updates",
+               "distill-")
 
     sub = command("evaluate", command_evaluate, "Plan with a model (expert or student) through "
                   "whole episodes.")
@@ -2444,6 +2893,10 @@ def main(argv=None):
             args.configs = tuple(
                 from_args(config, args, **(paper_preset(config) if args.preset == "paper" else {}))
                 for config in (DistillConfig, PlannerConfig))
+        elif args.command == "train":
+            args.configs = (from_args(ExpertConfig, args, batch_size=256, updates_per_step=0.5),
+                            from_args(PlannerConfig, args, **TRAINING_BUDGET),
+                            from_args(DistillConfig, args))
         else:
             paper = {"horizon": 3} if args.command == "benchmark" else {}
             args.configs = (from_args(PlannerConfig, args, **paper),)
@@ -2453,7 +2906,8 @@ def main(argv=None):
         return 2
     except KeyboardInterrupt:
         print("fac_tdmpc_ref.py: interrupted" + (
-            "; the same command goes on from its last checkpoint" * (args.command == "distill")),
+            "; the same command goes on from its last checkpoint"
+            * (args.command in ("distill", "train"))),
             file=sys.stderr)
         return 130
     if args.json:

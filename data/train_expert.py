@@ -211,37 +211,6 @@ class Learner:
 
 # ------------------------------------------------------------------------------ training
 
-class Replay:
-    """Whole episodes: obs (E, T+1, O), action (E, T, A), reward (E, T)."""
-
-    def __init__(self, dim_obs, dim_action, episodes):
-        steps = fac.EPISODE_STEPS
-        self.obs = np.zeros((episodes, steps + 1, dim_obs), np.float32)
-        self.action = np.zeros((episodes, steps, dim_action), np.float32)
-        self.reward = np.zeros((episodes, steps), np.float32)
-        self.count = 0
-
-    def add(self, obs, action, reward):
-        """Add episodes; the oldest go when the buffer is full."""
-        for o, a, r in zip(obs, action, reward):
-            i = self.count % len(self.obs)
-            self.obs[i], self.action[i], self.reward[i] = o, a, r
-            self.count += 1
-
-    def sample(self, rng, batch, horizon, task):
-        """Time-major segments, drawn evenly; for reacher half with a hindsight target [D6]."""
-        episode = rng.integers(min(self.count, len(self.obs)), size=batch)
-        start = rng.integers(fac.EPISODE_STEPS - horizon + 1, size=batch)
-        steps = start + np.arange(horizon + 1)[:, None]
-        obs = self.obs[episode, steps]
-        action, reward = self.action[episode, steps[:-1]], self.reward[episode, steps[:-1]]
-        if task.startswith("reacher"):
-            later = rng.integers(start + 1, fac.EPISODE_STEPS + 1)
-            chosen = rng.random(batch) < 0.5
-            fac.hindsight(obs, reward, self.obs[episode, later], chosen, task)
-        return obs, action, reward
-
-
 def train(args, config, planner):
     """Train until args.decisions or args.minutes.
 
@@ -253,7 +222,7 @@ def train(args, config, planner):
     _, _, dim_obs, dim_action = fac.lookup_task(args.task)
     rng = np.random.default_rng(args.seed)
     learner = Learner(dim_obs, dim_action, config, args.device)
-    replay = Replay(dim_obs, dim_action, config.buffer_size // fac.EPISODE_STEPS)
+    replay = fac.ReplayBuffer(dim_obs, dim_action, config.buffer_size, config.buffer_dtype)
     decisions, seconds, elapsed, began = 0, 0.0, 0.0, time.time()
     out = Path(args.out)
     out.mkdir(parents=True, exist_ok=True)
@@ -270,7 +239,7 @@ def train(args, config, planner):
         decisions, seconds = saved["decisions"], saved["seconds"]
         elapsed = seconds
         count = saved["obs"].shape[0]
-        replay.obs[:count], replay.action[:count] = saved["obs"], saved["action"]
+        replay.observation[:count], replay.action[:count] = saved["obs"], saved["action"]
         replay.reward[:count], replay.count = saved["reward"], saved["count"]
         rng.bit_generator.state = saved["rng"]
         torch.set_rng_state(saved["torch_rng"].cpu())
@@ -280,8 +249,9 @@ def train(args, config, planner):
 
     def learn(std):
         """One update on a fresh batch; returns its three loss terms."""
-        batch = replay.sample(rng, config.batch_size, config.horizon, args.task)
-        return [x.detach() for x in learner.update(*map(to_device, batch), std)]
+        obs, action, reward = replay.sample(rng, config.batch_size, config.horizon, args.task)
+        batch = map(to_device, (obs.swapaxes(1, 2), action.swapaxes(1, 2), reward))
+        return [x.detach() for x in learner.update(*batch, std)]
 
     def out_of_time():
         return args.minutes and time.time() - began > 60 * args.minutes
@@ -317,7 +287,8 @@ def train(args, config, planner):
                     break
             if done:
                 break
-            replay.add(*(np.stack(x, 1) for x in episode))
+            for one in zip(*(np.stack(x, 1) for x in episode)):
+                replay.add(*one)
             decisions += args.envs * fac.EPISODE_STEPS
             returns = np.sum(episode[2], 0)
             if warming and decisions >= config.seed_decisions:  # catch up on the random episodes
@@ -341,9 +312,9 @@ def train(args, config, planner):
                 writer.writerow([decisions, round(elapsed / 60, 2), round(std, 3), horizon,
                                  round(float(returns.mean()), 1), round(float(returns.min()), 1),
                                  round(float(returns.max()), 1), *(f"{t:.5g}" for t in terms)])
-            kept = min(replay.count, len(replay.obs))
+            kept = len(replay)
             state = {"settings": settings, "learner": learner.state(), "decisions": decisions,
-                     "seconds": elapsed, "obs": replay.obs[:kept],
+                     "seconds": elapsed, "obs": replay.observation[:kept],
                      "action": replay.action[:kept], "reward": replay.reward[:kept],
                      "count": replay.count, "rng": rng.bit_generator.state,
                      "torch_rng": torch.get_rng_state()}
@@ -372,16 +343,7 @@ def export(args, config, planner, learner, replay, decisions, minutes):
              "training_planner": dataclasses.asdict(planner)}
     fac.write_npz(folder / "expert.npz",
                   {"kind": "expert", "model": dataclasses.asdict(sizes), **about}, weights)
-    # oldest first; the last row of an episode holds its last observation and no action
-    order = np.arange(max(0, replay.count - len(replay.obs)), replay.count) % len(replay.obs)
-    steps = fac.EPISODE_STEPS
-    action = np.zeros((len(order), steps + 1, dim_action), np.float16)
-    action[:, :steps] = replay.action[order]
-    continues = np.ones((len(order), steps + 1), bool)
-    continues[:, -1] = False
-    fac.write_npz(folder / "replay.npz", {"kind": "replay", **about}, {
-        "observation": replay.obs[order].reshape(-1, dim_obs).astype(np.float16),
-        "action": action.reshape(-1, dim_action), "continues": continues.ravel()}, compress=True)
+    replay.write(folder / "replay.npz", about)
     write_golden(folder, replay, config)
     write_narrow_golden(folder.parent / "golden-narrow.npz")
 
@@ -489,10 +451,10 @@ def write_golden(folder, replay, config):
     model = TOLD(expert.config.dim_obs, expert.config.dim_action, config).double()
     model.load_state_dict({k: torch.tensor(v).double() for k, v in arrays.items()})
     obs, action, reward = replay.sample(rng, 16, config.horizon, "")
-    double = [torch.tensor(x).double() for x in (obs, action, reward)]
+    double = [torch.tensor(x).double() for x in (obs.swapaxes(1, 2), action.swapaxes(1, 2), reward)]
     found, eq1_grads = expert_golden(model, model, *double, config)
     found.update({f"equation1_grad {k}": fac.digest(g) for k, g in eq1_grads.items()})
-    found.update(obs=obs.swapaxes(1, 2), action=action.swapaxes(1, 2), rewards=reward)
+    found.update(obs=obs, action=action, rewards=reward)
 
     # one refinement of MPPI (Equation 2) with fixed noise
     planner = fac.PlannerConfig(samples=64, elites=8, pi_trajs=0, horizon=3)
@@ -526,7 +488,7 @@ def write_golden(folder, replay, config):
     actions = actions + distill.noise_std * rng.standard_normal(
         (*actions.shape[:3], distill.noise_samples), np.float32)
     with torch.no_grad():
-        latent = model.encode(torch.tensor(replay.obs[0, starts]).double()).T[None]
+        latent = model.encode(torch.tensor(replay.observation[0, starts]).double()).T[None]
         theirs = {k: torch.tensor(v).double() for k, v in expert.params.items()}
         targets = rollout(theirs, latent, torch.tensor(actions).double())
 
@@ -534,7 +496,7 @@ def write_golden(folder, replay, config):
         return equation_4(params, latent, torch.tensor(actions).double(), targets, dim_action,
                           distill)
 
-    found.update(kl_obs=replay.obs[0, starts].T, kl_actions=actions.astype(np.float32),
+    found.update(kl_obs=replay.observation[0, starts].T, kl_actions=actions.astype(np.float32),
                  kl_loss=np.array(loss().item()))
     found.update({f"kl_grad {k}": fac.digest(g) for k, g in gradients(loss(), params).items()})
     found["adam_losses"] = ten_adam_steps(params, loss, distill.lr, distill.grad_clip)

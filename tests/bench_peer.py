@@ -8,6 +8,7 @@ Table 2's (512 samples, 6 iterations, horizon 3).
 """
 import argparse
 import contextlib
+import importlib.util
 import json
 import os
 import sys
@@ -133,7 +134,7 @@ class TorchDistiller:
     """Algorithm 1 with the same networks, batch and settings as fac.Distiller."""
 
     def __init__(self, distiller, replay):
-        self.config, self.agents = distiller.config, distiller.model_config.num_agents
+        self.config, self.agents = distiller.config, distiller.student.config.num_agents
         self.expert, self.student = to_torch(distiller.expert), to_torch(distiller.student)
         self.trained = [p.requires_grad_() for k, p in self.student.items()
                         if not k.startswith("_expert")]
@@ -205,13 +206,31 @@ def distillation(threads, turns):
         os.sched_setaffinity(0, cores)
 
 
+def training(threads, turns, batch=256):
+    """(ratio, our ms, PyTorch's ms) of an update of Equation 1, policy and averages included."""
+    spec = importlib.util.spec_from_file_location("train_expert", fac.DATA / "train_expert.py")
+    train_expert = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(train_expert)
+    config, rng = fac.ExpertConfig(batch_size=batch), np.random.default_rng(0)
+    ours = fac.Learner(fac.ModelConfig(24, 6), config, rng)
+    theirs = train_expert.Learner(24, 6, config, "cpu")
+    obs = rng.standard_normal((4, 24, batch), np.float32)
+    reward = rng.random((3, batch), np.float32)
+    actions = rng.uniform(-1, 1, (3, 6, batch)).astype(np.float32)
+    their_batch = [torch.tensor(x) for x in (obs.swapaxes(1, 2), actions.swapaxes(1, 2), reward)]
+    torch.set_num_threads(threads)
+    with fac._thread_pools().limit(limits=threads, user_api="blas"):
+        return ratios(lambda: ours.update(obs, actions, reward, 0.1, rng),
+                      lambda: theirs.update(*their_batch, 0.1), turns)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--turns", type=int, default=9, help="of each comparison [9]")
     parser.add_argument("--json", action="store_true", help="print one JSON object as last line")
     args = parser.parse_args()
-    result = {"central_ratio": None, "fac_ratio": {}, "distill_ratio": {}, "cores": os.cpu_count(),
-              "torch": torch.__version__, "numpy": np.__version__}
+    result = {"central_ratio": None, "fac_ratio": {}, "distill_ratio": {}, "update_ratio": {},
+              "cores": os.cpu_count(), "torch": torch.__version__, "numpy": np.__version__}
 
     def show(what, found, threads=1):
         per = 20 if what.startswith("distillation") else 1
@@ -231,6 +250,8 @@ def main():
         if threads <= len(os.sched_getaffinity(0)):
             result["distill_ratio"][str(threads)] = show(
                 "distillation step", distillation(threads, args.turns), threads)
+            result["update_ratio"][str(threads)] = show(
+                "update of TD-MPC (batch 256)", training(threads, args.turns), threads)
     if args.json:
         print(json.dumps(result))
 

@@ -286,7 +286,7 @@ def test_distill_refuses(tmp_path, files, flags, parts):
 
 @pytest.mark.parametrize("arguments, parts", [
     ([], ["COMMAND"]),
-    (["train"], ["'train'", "distill"]),
+    (["tarin"], ["'tarin'", "distill"]),
     (["evaluate"], ["--model"]),
     (["benchmark", "--robots", "reecher"], ["'reecher'", *fac.ROBOTS]),
     (["benchmark", "--runs", "9"], ["runs", "at least 10"]),

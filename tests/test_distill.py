@@ -79,8 +79,8 @@ def test_a_resumed_run_ends_as_an_uninterrupted_one(replay):
 @pytest.mark.parametrize("n", [1, 3])
 def test_any_divisor_of_the_actions(replay, n):
     distiller, losses = distilled(replay, CONFIG, 2, n)
-    assert distiller.model_config.num_agents == n
-    assert distiller.model_config.mlp_dim == max(512 // n, 50)
+    assert distiller.student.config.num_agents == n
+    assert distiller.student.config.mlp_dim == max(512 // n, 50)
     assert np.isfinite(losses).all()
 
 
