@@ -109,9 +109,9 @@ class PlannerConfig:
     pi_trajs: int = field(24, "policy proposals, where the model has a policy (Table 2)")
     horizon: int = field(1, "H: rewards that are summed before Q (H - 1 with value_at last) [D5]",
                          paper=3)
-    value_at: str = field("after", "where Q ends the return: after (Equation 2: H rewards, then Q "
-                          "of action H + 1) or last (authors' code: Q of action H)",
-                          choices=("after", "last"))
+    value_at: str = field("last", "where Q ends the return: after (Equation 2: H rewards, then Q "
+                          "of action H + 1) or last (authors' code: Q of action H) [D5]",
+                          paper="after", choices=("after", "last"))
     discount: float = field(0.99, "gamma (Table 2)")
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)")
     max_std: float = field(2.0, "first and largest sampling deviation (Table 2)")
@@ -145,9 +145,9 @@ class PlannerConfig:
 @dataclass(frozen=True)
 class DistillConfig:
     """Algorithm 1. `--preset paper` takes each field's paper value."""
-    steps: int = field(20_000, "gradient steps [D1]", paper=100_000)
-    batch_size: int = field(16, "B: states in a step [D1]", paper=512)
-    noise_samples: int = field(10, "K: perturbations of each action (section 4.4)")
+    steps: int = field(30_000, "gradient steps [D1]", paper=100_000)
+    batch_size: int = field(32, "B: states in a step [D1]", paper=512)
+    noise_samples: int = field(5, "K: perturbations of each action (section 4.4) [D1]", paper=10)
     noise_std: float = field(2.0, "largest deviation of the perturbations [D8]", paper=0.5)
     noise_std_min: float = field(0.2, "smallest; each state's is drawn between, evenly in the "
                                  "logarithm [D8]", paper=0.5)
@@ -534,9 +534,9 @@ class WorldModel:
             params[f"{name}.{i}.bias"] = np.zeros((*shape[:2], 1), dtype)
         return cls(config, params)
 
-    def encode(self, obs):
+    def encode(self, obs, empty=np.empty):
         """s = f_E(g).  obs (O, B) -> latents (N, m, B)."""
-        return self.encode_features(self.encoder_features(obs))
+        return self.encode_features(self.encoder_features(obs), None, empty)
 
     def encoder_features(self, obs):
         """What the trained encoder reads, (1, F, B): the observation or the expert's latent."""
@@ -558,14 +558,15 @@ class WorldModel:
         """r^i = f_R^i(s^i, a^i) -> (N, B); the global reward is the sum over N."""
         return forward(MLP, self.params, "_reward", np.concatenate([z, a], 1))[:, 0]
 
-    def q(self, z, a):
+    def q(self, z, a, empty=np.empty):
         """Both values q^i = f_Q^i(s^i, a^i) -> two (N, B); the global ones are the sums."""
         x = np.concatenate([z, a], 1)
-        return tuple(forward(QNET, self.params, name, x)[:, 0] for name in ("_Q1", "_Q2"))
+        return tuple(forward(QNET, self.params, name, x, None, empty)[:, 0]
+                     for name in ("_Q1", "_Q2"))
 
-    def policy(self, z):
+    def policy(self, z, empty=np.empty):
         """The expert's policy mean, z (1, m, B) -> (1, A, B) in (-1, 1)."""
-        return np.tanh(forward(MLP, self.params, "_pi", z))
+        return np.tanh(forward(MLP, self.params, "_pi", z, None, empty))
 
     @property
     def has_policy(self):
@@ -685,7 +686,7 @@ def predict_backward(model, tapes, d_outputs, grads, empty=np.empty, d_latents=N
 POLICY_NOISE = 0.3  # TD-MPC's policy noise is cut here
 
 
-def td_targets(model, target, obs, reward, noise, discount):
+def td_targets(model, target, obs, reward, noise, discount, empty=np.empty):
     """What Equation 1 holds fixed: latents of the moving-average encoder, and TD targets.
 
     obs (H, O, B): the observation after each action; reward (H, B); noise (A, H * B): the
@@ -693,9 +694,9 @@ def td_targets(model, target, obs, reward, noise, discount):
     r_h + gamma min(Q1, Q2)(s_{h+1}, pi(s_{h+1})) (H, B) with the moving averages of Q.
     """
     after = np.ascontiguousarray(obs.swapaxes(0, 1)).reshape(obs.shape[1], -1)
-    z = model.encode(after)
-    q = np.minimum(*target.q(z, np.clip(model.policy(z) + noise, -1, 1)))
-    return target.encode(after), reward + discount * q.reshape(reward.shape)
+    z = model.encode(after, empty)
+    q = np.minimum(*target.q(z, np.clip(model.policy(z, empty) + noise, -1, 1), empty))
+    return target.encode(after, empty), reward + discount * q.reshape(reward.shape)
 
 
 def equation_1(model, obs, actions, reward, latents, td, config, grads=None, empty=np.empty):
@@ -780,7 +781,8 @@ class Learner:
         noise = rng.standard_normal((dim_action, 2 * steps + 1, batch), F32)
         noise = np.clip(noise * F32(std), -POLICY_NOISE, POLICY_NOISE)
         latents, td = td_targets(self.model, self.target, obs[1:], reward,
-                                 noise[:, :steps].reshape(dim_action, -1), config.discount)
+                                 noise[:, :steps].reshape(dim_action, -1), config.discount,
+                                 self._arena.empty)
         _, terms, rollout = equation_1(self.model, obs[0], actions, reward, latents, td, config,
                                        self.optimizer.grads, self._arena.empty)
         self.optimizer.step(config.lr, config.grad_clip)
@@ -2241,7 +2243,7 @@ class OnlineStudent:
         return losses
 
 
-TRAINING_BUDGET = {"samples": 128, "iterations": 4, "horizon": 3}
+TRAINING_BUDGET = {"samples": 128, "iterations": 4, "horizon": 3, "value_at": "after"}
 TRAINING_CURVE = ("decisions", "updates", "seconds", "std", "horizon", "return_mean", "return_min",
                   "return_max", "consistency", "reward", "value", "kl_reward", "kl_value",
                   "eval_expert", "eval_student")
@@ -2300,7 +2302,10 @@ class Training:
                                [self.config.std_start, self.planning.min_std]))
 
     def round(self, actors, bar):
-        """Episodes and the updates they allow, side by side; adds a row to the curve."""
+        """Episodes and the updates they allow, side by side; adds a row to the curve.
+
+        Evaluations are of the weights at the round's start, as its episodes are.
+        """
         args, config, began = self.args, self.config, time.time()
         quota = args.envs * EPISODE_STEPS
         horizon = int(np.interp(self.decisions, [0, config.std_steps], [1, self.planning.horizon]))
@@ -2339,12 +2344,15 @@ class Training:
         bar.set_postfix_str(f"{self.decisions:,} decisions, return {np.mean(played):.0f}" + "".join(
             f", {name} {r:.0f}" for name, r in zip(tested, tests)), False)
 
+    def optimizers(self):
+        """Everything that is learned, by name."""
+        found = {"expert": self.learner.optimizer, "policy": self.learner.policy_optimizer}
+        return {**found, "student": self.student.optimizer} if self.student else found
+
     def state(self):
         """(header, arrays) that a resumed run needs; `load` takes them back."""
-        parts = {"expert": self.learner.optimizer, "policy": self.learner.policy_optimizer}
-        if self.student:
-            parts["student"] = self.student.optimizer
-        arrays = {f"{name} {k}": v for name, part in parts.items() for k, v in part.state().items()}
+        arrays = {f"{name} {k}": v for name, part in self.optimizers().items()
+                  for k, v in part.state().items()}
         kept = len(self.buffer)
         arrays.update(slow=self.learner.slow_vector, count=np.int64(self.buffer.count),
                       observation=self.buffer.observation[:kept],
@@ -2355,14 +2363,11 @@ class Training:
     def load(self, header, arrays, where):
         """Go on from a `state`; UserError if it is another run's."""
         same_settings(header["settings"], self.settings, where)
-        parts = {"expert": self.learner.optimizer, "policy": self.learner.policy_optimizer}
-        if self.student:
-            parts["student"] = self.student.optimizer
-        for name, part in parts.items():
-            part.load({k[len(name) + 1:]: v for k, v in arrays.items() if k.startswith(name + " ")})
-        for key in ("slow", "count", "observation", "action", "reward"):
+        for key in self.state()[1]:
             if key not in arrays:
                 raise UserError(f"{where}: {key}: missing; delete the file to start anew")
+        for name, part in self.optimizers().items():
+            part.load({k[len(name) + 1:]: v for k, v in arrays.items() if k.startswith(name + " ")})
         self.learner.slow_vector[:] = arrays["slow"]
         kept = len(arrays["reward"])
         self.buffer.count = int(arrays["count"])
@@ -2881,7 +2886,7 @@ def make_parser():
     sub.add_argument("--runs", type=int, default=100, help="of each network; decisions are timed a "
                      "tenth as often [100]")
     sub.add_argument("--figure", help="draw Figure 6 into this file")
-    add_config(sub, PlannerConfig, horizon=3)
+    add_config(sub, PlannerConfig, **paper_preset(PlannerConfig))
     return parser
 
 
@@ -2898,7 +2903,7 @@ def main(argv=None):
                             from_args(PlannerConfig, args, **TRAINING_BUDGET),
                             from_args(DistillConfig, args))
         else:
-            paper = {"horizon": 3} if args.command == "benchmark" else {}
+            paper = paper_preset(PlannerConfig) if args.command == "benchmark" else {}
             args.configs = (from_args(PlannerConfig, args, **paper),)
         result = args.run(args)
     except UserError as error:

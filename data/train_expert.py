@@ -457,7 +457,7 @@ def write_golden(folder, replay, config):
     found.update(obs=obs, action=action, rewards=reward)
 
     # one refinement of MPPI (Equation 2) with fixed noise
-    planner = fac.PlannerConfig(samples=64, elites=8, pi_trajs=0, horizon=3)
+    planner = fac.PlannerConfig(samples=64, elites=8, pi_trajs=0, horizon=3, value_at="after")
     dim_action = expert.config.dim_action
     noise = rng.standard_normal((planner.rewards + 1, dim_action, planner.samples), np.float32)
     mean = rng.uniform(-0.5, 0.5, (planner.rewards + 1, dim_action)).astype(np.float32)
@@ -478,7 +478,7 @@ def write_golden(folder, replay, config):
                  mppi_std=std.clamp(planner.min_std, planner.max_std).numpy())
 
     # Equation 4 for a fresh student of the default preset, N = dim(A)
-    distill = fac.DistillConfig(batch_size=8, **AS_PRINTED)
+    distill = fac.DistillConfig(batch_size=8, noise_samples=10, **AS_PRINTED)
     sizes = fac.student_config(expert.config, dim_action, distill.sizes, distill.encoder_input)
     params = alive_student(sizes, rng, torch.float64)
     found.update({f"student {k}": v.detach().numpy().astype(np.float32) for k, v in params.items()
@@ -574,7 +574,7 @@ def main(argv=None):
     parser.add_argument("--out", default=None, help="checkpoint directory [runs/expert-<task>]")
     parser.add_argument("--data", default=None, help="where to export [this script's folder]")
     fac.add_config(parser, fac.ExpertConfig)
-    few = {"samples": 128, "iterations": 4, "horizon": 3}
+    few = fac.TRAINING_BUDGET
     fac.add_config(parser, fac.PlannerConfig, "MPPI while training", "plan-", **few)
     args = parser.parse_args(argv)
     args.out = args.out or f"runs/expert-{args.task}"

@@ -138,7 +138,7 @@ except SystemExit as end:
     ((), ["distill", "evaluate", "benchmark"]),
     (("benchmark",), ["--robots", "humanoid", "--figure", "--iterations", "[3; paper: 3]"]),
     (("distill",), ["--task", "--preset", "--num-agents", "--evaluate-expert", "--plan-samples",
-                    "[20000; paper: 100000]", "[forward; paper: reverse]", "reacher-hard"]),
+                    "[30000; paper: 100000]", "[forward; paper: reverse]", "reacher-hard"]),
     (("evaluate",), ["--model", "--record", "--samples", "--output", "[6]"])])
 def test_help_is_quick_and_starts_nothing(tmp_path, command, expected):
     done = succeeded(launch(["-c", WATCHED, *command, "--help"], tmp_path))
@@ -175,7 +175,7 @@ def configs_of(monkeypatch, *arguments):
 def test_default_settings_are_those_of_the_dataclasses(monkeypatch):
     assert configs_of(monkeypatch, "distill") == (fac.DistillConfig(), fac.PlannerConfig())
     assert configs_of(monkeypatch, "evaluate", "--model", "x") == (fac.PlannerConfig(),)
-    assert configs_of(monkeypatch, "benchmark") == (fac.PlannerConfig(horizon=3),)  # Table 2
+    assert configs_of(monkeypatch, "benchmark") == (fac.PlannerConfig(horizon=3, value_at="after"),)
 
 
 def test_preset_paper_is_the_paper(monkeypatch):
