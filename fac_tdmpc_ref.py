@@ -4,12 +4,14 @@ A TD-MPC expert (encoder, dynamics, reward, value; planning by MPPI in latent sp
 into a student whose latent state, dynamics, reward and value fall apart into one small model for
 each action dimension. Each joint then plans alone: cheaper, and in parallel. What that keeps of
 the return is measured, in the README. This file holds the method whole: networks with
-hand-written gradients, Adam, Algorithm 1 (Equation 4), MPPI (Equations 2 and 3), planning
-workers, environments, and the command line. PyTorch is needed only to train new experts
-(data/train_expert.py).
+hand-written gradients, Adam, TD-MPC's Equation 1, Algorithm 1 (Equation 4), MPPI (Equations 2 and
+3), planning workers, environments, and the command line. The experts in data/ were trained by
+the same Equation 1 in PyTorch (data/train_expert.py), which the golden tests compare with.
 
     python fac_tdmpc_ref.py distill --task reacher-hard
-    python fac_tdmpc_ref.py evaluate --task reacher-hard --model runs/reacher-hard-0/student.npz
+    python fac_tdmpc_ref.py evaluate --model runs/reacher-hard-0/student.npz
+    python fac_tdmpc_ref.py benchmark
+    python fac_tdmpc_ref.py train --task reacher-easy --student fac
 
 The one idea that keeps it small: every model carries an agent axis N, and a centralized model is
 the case N = 1. There is one world model, one planner, one loss. The axes, everywhere:
@@ -153,8 +155,7 @@ class DistillConfig:
                                  "logarithm [D8]", paper=0.5)
     clip_actions: bool = field(True, "clip perturbed actions to [-1, 1], where planning looks [D8]",
                                paper=False)
-    horizon: int = field(1, "H: steps of the latent rollout, as far as planning looks [D5]",
-                         paper=3)
+    horizon: int = field(1, "H: steps of the latent rollout [D5]", paper=3)
     final_term: bool = field(True, "sum over h = 0..H as printed; off: 0..H-1 as the authors' code")
     lam: float = field(1.0, "lambda: weight of step h is lambda^h (rho in Table 2) [D5]", paper=0.5)
     reward_coef: float = field(0.5, "weight of the rewards' divergence (Table 2)")
@@ -231,8 +232,12 @@ class ExpertConfig:
                 raise UserError(f"training: {name} must be at least 1, not {getattr(self, name)}")
         for name in ("updates_per_step", "discount", "lam", "consistency_coef", "reward_coef",
                      "value_coef", "tau", "std_start", "std_steps", "seed_decisions"):
-            if not getattr(self, name) >= 0:
-                raise UserError(f"training: {name} must be at least 0, not {getattr(self, name)}")
+            if not 0 <= getattr(self, name) < np.inf:
+                raise UserError(f"training: {name} must be at least 0 and finite, not "
+                                f"{getattr(self, name)}")
+        if self.horizon > EPISODE_STEPS:
+            raise UserError(f"training: horizon must be at most an episode's {EPISODE_STEPS}, not "
+                            f"{self.horizon}")
         if not (self.lr > 0 and self.grad_clip > 0):
             raise UserError(f"training: lr and grad_clip must be above 0, not {self.lr} and "
                             f"{self.grad_clip}")
@@ -1262,8 +1267,9 @@ class Planner:
 
     def hand_over(self):
         """Wake all workers and wait for their answers, without planning: what `act` pays."""
-        self._workers.send_all("hello")
-        self._workers.receive_all()
+        if self._workers:
+            self._workers.send_all("hello")
+            self._workers.receive_all()
 
     def close(self):
         """End the worker processes."""
@@ -1356,10 +1362,11 @@ class Workers:
         """The next message of every worker, in their order."""
         return [self.receive(i) for i in range(len(self._members))]
 
-    def ready(self):
-        """Indices of workers with a message (or an end), at least one: waits for it."""
+    def ready(self, timeout=None):
+        """Indices of workers with a message (or an end); waits for one, or `timeout` seconds."""
         connections = [connection for _, connection in self._members]
-        return [connections.index(c) for c in multiprocessing.connection.wait(connections)]
+        return [connections.index(c)
+                for c in multiprocessing.connection.wait(connections, timeout)]
 
     def _died(self, i):
         process = self._members[i][0]
@@ -2065,6 +2072,15 @@ def recorded_returns(header, config, seeds):
     return record["returns"][:len(seeds)]
 
 
+def output_folder(path):
+    """The folder, made if it wasn't there; UserError if it can't be."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{path}: can't be written: {error.strerror}") from None
+    return Path(path)
+
+
 def command_distill(args):
     """distill: expert and replay in, student, learning curve, table and JSON out."""
     began = time.time()
@@ -2072,7 +2088,7 @@ def command_distill(args):
     lookup_task(args.task)
     if args.episodes < 1:
         raise UserError(f"episodes must be at least 1, not {args.episodes}")
-    if args.expert and Path(args.expert).is_dir():  # as `train` and data/TASK hold them
+    if args.expert and os.path.isdir(args.expert):  # as `train` and data/TASK hold them
         args.replay = args.replay or Path(args.expert) / "replay.npz"
         args.expert = Path(args.expert) / "expert.npz"
     expert_path = args.expert or data_file(args.task, "expert.npz")
@@ -2082,11 +2098,7 @@ def command_distill(args):
             raise UserError(f"{expert_path}: header: {key}: expected {expected!r}, found "
                             f"{header.get(key)!r}")
     replay = Replay(args.replay or data_file(args.task, "replay.npz"))
-    out = Path(args.out or f"runs/{args.task}-{args.seed}")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{out}: can't be written: {error.strerror}") from None
+    out = output_folder(args.out or f"runs/{args.task}-{args.seed}")
     distiller = Distiller(expert, replay, config, args.num_agents, args.seed)
     num_agents = distiller.student.config.num_agents
     beside = useful_workers(num_agents) if args.plan_workers is None else args.plan_workers
@@ -2120,7 +2132,7 @@ def command_distill(args):
     with Planner(expert, planning) as central, Planner(student, planning) as alone, \
             Planner(student, planning, workers=beside) as parallel:
         ms = measure_planning([central, alone, parallel], rows.astype(F32))
-    if args.plan_workers is None and ms[2] >= ms[1]:
+    if not beside or (args.plan_workers is None and ms[2] >= ms[1]):
         beside, ms[2] = 0, ms[1]  # handing over costs more than it saves
 
     result = {
@@ -2141,7 +2153,7 @@ def command_distill(args):
 
     print(f"\n{args.task}, {args.episodes} episodes, evaluation seed {args.eval_seed}, MPPI with "
           f"{planning.samples} samples, {planning.iterations} iterations, horizon "
-          f"{planning.horizon}\n")
+          f"{planning.horizon}, value_at {planning.value_at}\n")
     print_table([
         ("", "return", "ms a decision", "speed-up"),
         (f"expert ({'recorded' if recorded else 'measured now'}), one process",
@@ -2151,11 +2163,17 @@ def command_distill(args):
          f"{ms[1]:.1f}", f"{ms[0] / ms[1]:.1f}")] + [
         (f"student, {beside} worker{'s' * (beside != 1)} beside", "the same plans",
          f"{ms[2]:.1f}", f"{ms[0] / ms[2]:.1f}")] * (beside > 0))
-    print(f"\nreturn kept {np.mean(found['returns']) / max(np.mean(returns), 1e-9):.2f}, rank "
+    share = kept(np.mean(found["returns"]), np.mean(returns))
+    print(f"\nreturn kept {'-' if share is None else f'{share:.2f}'}, rank "
           f"correlation of Q {rank[0]:.3f} (h = 0) to {rank[-1]:.3f} (h = {len(rank) - 1}), "
           f"distilled in {seconds:.0f} s, {result['seconds_total']:.0f} s in all, {out}/"
           + ("" if drawn else "\n(no picture: pip install 'fac-tdmpc-ref[plots]' draws curve.png)"))
     return result
+
+
+def kept(student, expert):
+    """The share of the expert's return that a student keeps; None if there is nothing to keep."""
+    return float(student / expert) if expert > 0 else None
 
 
 def print_table(rows):
@@ -2190,13 +2208,15 @@ def explore(environment, planner, seed, std):
 
 
 def _acting_worker(connection):
-    environment = Environment(connection.recv())
+    task = connection.recv()
+    models, jobs = connection.recv()  # before anything can fail: the parent waits until it is read
+    environment = Environment(task)
     while True:
-        models, jobs = connection.recv()
         planners = {name: Planner(WorldModel(*model), config)
                     for name, (*model, config) in models.items()}
         for name, seed, std in jobs:
             connection.send(explore(environment, planners.get(name), seed, std))
+        models, jobs = connection.recv()
 
 
 class Actors:
@@ -2209,15 +2229,25 @@ class Actors:
 
     def start(self, models, jobs):
         """models: {name: (model, planner config)}; jobs: (name, or None for random; seed; std)."""
-        self._jobs = len(jobs)
         models = {name: (model.config, model.params, config)
                   for name, (model, config) in models.items()}
-        for i in range(self._count):
-            self._workers.send(i, (models, jobs[i::self._count]))
+        self._shares = [jobs[i::self._count] for i in range(self._count)]
+        self._arrived = [[] for _ in self._shares]
+        for i, share in enumerate(self._shares):
+            self._workers.send(i, (models, share))
+
+    def drain(self):
+        """Take what has arrived, so that no actor waits for a full pipe."""
+        for i in self._workers.ready(timeout=0):
+            self._arrived[i].append(self._workers.receive(i))
 
     def collect(self):
         """What `explore` gave for every job, in their order."""
-        return [self._workers.receive(i % self._count) for i in range(self._jobs)]
+        for i, share in enumerate(self._shares):
+            while len(self._arrived[i]) < len(share):
+                self._arrived[i].append(self._workers.receive(i))
+        return [self._arrived[i % self._count][i // self._count]
+                for i in range(sum(map(len, self._shares)))]
 
     def close(self):
         """End the processes."""
@@ -2287,12 +2317,15 @@ class Training:
         kl = self.student.update(obs[0], actions)[1:] if self.student else (0.0, 0.0)
         return *terms, *kl
 
-    def learn_until(self, updates, bar):
+    def learn_until(self, updates, bar, actors=None):
         """Updates until there were so many; returns their losses."""
-        losses = []
+        began, losses = time.time(), []
         while self.updates < updates:
             losses.append(self.learn())
             bar.update()
+            if actors:
+                actors.drain()
+        self.seconds += time.time() - began
         return losses
 
     @property
@@ -2304,9 +2337,10 @@ class Training:
     def round(self, actors, bar):
         """Episodes and the updates they allow, side by side; adds a row to the curve.
 
-        Evaluations are of the weights at the round's start, as its episodes are.
+        Evaluations are of the weights at the round's start, as its episodes are, and plan with the
+        training budget and the default horizon.
         """
-        args, config, began = self.args, self.config, time.time()
+        args, config = self.args, self.config
         quota = args.envs * EPISODE_STEPS
         horizon = int(np.interp(self.decisions, [0, config.std_steps], [1, self.planning.horizon]))
         first, std = self.decisions // EPISODE_STEPS, self.std
@@ -2323,11 +2357,15 @@ class Training:
             tested = {"expert": self.learner.model}
             if self.student:
                 tested["student"] = self.student.model
-            models.update({name: (model, self.planning) for name, model in tested.items()})
+            default = PlannerConfig()
+            config = dataclasses.replace(self.planning, horizon=default.horizon,
+                                         value_at=default.value_at)
+            models.update({name: (model, config) for name, model in tested.items()})
             jobs += [(name, seed, 0.0) for name in tested
                      for seed in episode_seeds(args.seed + 1, args.evaluate_episodes)]
         actors.start(models, jobs)
-        losses += self.learn_until(due, bar)
+        losses += self.learn_until(due, bar, actors)
+        began = time.time()
         episodes = actors.collect()
         returns = [float(reward.sum()) for *_, reward in episodes]
         for episode in episodes[:args.envs]:
@@ -2399,19 +2437,22 @@ def command_train(args):
     for name in ("envs", "workers", "evaluate_every", "evaluate_episodes"):
         if getattr(args, name) < 1:
             raise UserError(f"{name} must be at least 1, not {getattr(args, name)}")
+    if not planning.min_std <= config.std_start <= planning.max_std:
+        raise UserError(f"training: std_start must lie between the planner's min_std and max_std "
+                        f"({planning.min_std}, {planning.max_std}), not {config.std_start}")
     if args.steps < quota:
         raise UserError(f"{args.envs} environments need at least {quota} steps, not {args.steps}")
     if not args.student:
         distilling = None
     else:
-        args.num_agents = args.num_agents or dim_action
+        args.num_agents = dim_action if args.num_agents is None else args.num_agents
         total = max(1, int(config.updates_per_step * (args.steps // quota * quota)))
         distilling = dataclasses.replace(distilling, steps=total)
         if distilling.horizon + distilling.final_term > config.horizon:
             raise UserError(f"the student looks {distilling.horizon + distilling.final_term} steps "
                             f"ahead, the expert's batches hold {config.horizon}; lower "
                             f"--distill-horizon or raise --horizon")
-    out = Path(args.out or f"runs/train-{args.task}-{args.seed}")
+    out = output_folder(args.out or f"runs/train-{args.task}-{args.seed}")
     training, checkpoint = Training(args, config, planning, distilling), out / "checkpoint.npz"
     if checkpoint.exists():
         training.load(*read_npz(checkpoint, ("checkpoint",)), checkpoint)
@@ -2463,7 +2504,7 @@ def command_train(args):
         save_model(out / f"{kind}.npz", model, header)
     if training.student:
         if args.episodes:
-            result["ratio"] = result["student_return_mean"] / max(result["return_mean"], 1e-9)
+            result["ratio"] = kept(result["student_return_mean"], result["return_mean"])
         result["lag"] = {str(p): lag(training.curve, p / 100) for p in (50, 75, 90)}
     drawn = draw_training(out / "curve.png", training.curve, f"{args.task}, seed {args.seed}")
     checkpoint.unlink()
@@ -2620,8 +2661,9 @@ def benchmark_decisions(robot, workers, planning, turns):
     ms_median, floor_ms, ratio_to_floor; and the microseconds of a hand-over to the workers."""
     _, n, *_ = ROBOTS[robot]
     obs = np.random.default_rng(0).standard_normal(ROBOTS[robot][0], F32)
-    budgets = [planning] + [dataclasses.replace(planning, elites=0, **change) for change in
-                            ({"samples": 128}, {"iterations": 2})]  # Figure 7
+    budgets = [planning] + [dataclasses.replace(planning, elites=0, **{name: value})
+                            for name, value in (("samples", 128), ("iterations", 2))  # Figure 7
+                            if getattr(planning, name) != value]
     presets = {"table2": ((50, 512), (50, max(512 // n, 50))),
                "section51": ((512, 512), (512 // n, 512 // n))}
     subjects = []
@@ -2650,7 +2692,7 @@ def benchmark_decisions(robot, workers, planning, turns):
         rows.append({"robot": robot, "model": model, "preset": preset, "mode": mode,
                      "samples": config.samples, "iterations": config.iterations,
                      "ms_median": ms, "floor_ms": floor, "ratio_to_floor": ms / floor})
-    return rows, 1e6 * float(np.median(hand_over))
+    return rows, 1e6 * float(np.median(hand_over)) if workers else None
 
 
 def one_agent(model, config):
@@ -2683,6 +2725,7 @@ def speedups(prediction, decision, planning):
 def command_benchmark(args):
     """benchmark: Table 3 and whole decisions on this machine."""
     (planning,) = args.configs
+    args.robots = list(dict.fromkeys(args.robots))
     for robot in args.robots:
         if robot not in ROBOTS:
             raise UserError(f"unknown robot {robot!r}; known: {', '.join(ROBOTS)}")
@@ -2699,10 +2742,11 @@ def command_benchmark(args):
             prediction += benchmark_prediction(robot, workers, args.runs)
             rows, hand_over = benchmark_decisions(robot, workers, planning, args.runs // 10)
             decision += rows
-            hand_overs.append(hand_over)
+            hand_overs += [hand_over] * (hand_over is not None)
     result = {"prediction": prediction, "decision": decision,
               "speedup": speedups(prediction, decision, planning),
-              "handover_us": float(np.median(hand_overs)), "cores": os.cpu_count() or 1}
+              "handover_us": float(np.median(hand_overs)) if hand_overs else None,
+              "cores": os.cpu_count() or 1}
     print_benchmark(result, args.robots)
     if args.figure:
         draw_prediction(args.figure, prediction, args.robots)
@@ -2732,8 +2776,9 @@ def print_benchmark(result, robots):
         (*key, *(f"{ms:.2f} ({times_floor:.2f})" for ms, times_floor in cells),
          " / ".join(f"{cells[0][0] / ms:.1f}" for ms, _ in cells[1:]))
         for key, cells in rows.items()])
-    print(f"\na hand-over to the workers and back: {result['handover_us']:.0f} us; "
-          f"{result['cores']} cores")
+    us = result["handover_us"]
+    print("\nno workers" if us is None else f"\na hand-over to the workers and back: {us:.0f} us",
+          f"{result['cores']} cores", sep="; ")
 
 
 def draw_prediction(path, prediction, robots):
@@ -2754,10 +2799,12 @@ def draw_prediction(path, prediction, robots):
     save_figure(path, figure)
 
 
-def add_config(parser, config_class, title=None, prefix="", **defaults):
-    """A flag for every field of a config; `--help` shows default and paper value."""
+def add_config(parser, config_class, title=None, prefix="", skip=(), **defaults):
+    """A flag for every field of a config but `skip`; `--help` shows default and paper value."""
     group = parser.add_argument_group(title or config_class.__doc__.split(".")[0])
     for f in dataclasses.fields(config_class):
+        if f.name in skip:
+            continue
         default, paper = defaults.get(f.name, f.default), f.metadata["paper"]
         shown = f"{default}" if paper is None else f"{default}; paper: {paper}"
         kind = {"action": argparse.BooleanOptionalAction}
@@ -2772,7 +2819,7 @@ def add_config(parser, config_class, title=None, prefix="", **defaults):
 def from_args(config_class, args, **defaults):
     """The config that the flags of `add_config` give, on top of `defaults`."""
     for f in dataclasses.fields(config_class):
-        value = getattr(args, f"{config_class.__name__}.{f.name}")
+        value = getattr(args, f"{config_class.__name__}.{f.name}", None)
         if value is not None:
             defaults[f.name] = value
     return config_class(**defaults)
@@ -2860,8 +2907,8 @@ def make_parser():
     sub.add_argument("--evaluate-episodes", type=natural, default=4, help="episodes in one [4]")
     add_config(sub, ExpertConfig, batch_size=256, updates_per_step=0.5)
     add_config(sub, PlannerConfig, "MPPI while training", "plan-", **TRAINING_BUDGET)
-    add_config(sub, DistillConfig, "The student (Algorithm 1); its steps are the updates",
-               "distill-")
+    add_config(sub, DistillConfig, "The student (Algorithm 1), on the expert's batches and steps",
+               "distill-", skip=("steps", "batch_size", "new_targets", "held_out"))
 
     sub = command("evaluate", command_evaluate, "Plan with a model (expert or student) through "
                   "whole episodes.")

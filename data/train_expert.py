@@ -575,7 +575,8 @@ def main(argv=None):
     parser.add_argument("--data", default=None, help="where to export [this script's folder]")
     fac.add_config(parser, fac.ExpertConfig)
     few = fac.TRAINING_BUDGET
-    fac.add_config(parser, fac.PlannerConfig, "MPPI while training", "plan-", **few)
+    fac.add_config(parser, fac.PlannerConfig, "MPPI while training", "plan-",
+                   skip=("value_at", "discount", "output"), **few)
     args = parser.parse_args(argv)
     args.out = args.out or f"runs/expert-{args.task}"
     try:

@@ -371,6 +371,14 @@ def test_benchmark_measures_every_mode(tmp_path):
         assert (tmp_path / "figure6.png").read_bytes()[:4] == b"\x89PNG"
 
 
+def test_benchmark_without_workers_and_with_a_budget_of_its_own(tmp_path):
+    found = last_json(run("benchmark", "--robots", "reacher", "reacher", "--runs", "10",
+                          "--samples", "128", "--iterations", "2", "--workers", "0", "--json",
+                          cwd=tmp_path))
+    assert found["handover_us"] is None
+    assert len(found["prediction"]) == 18 and len(found["decision"]) == 2 * 4
+
+
 # distill ------------------------------------------------------------------------------
 
 

@@ -110,10 +110,13 @@ def test_a_killed_run_goes_on_to_the_same_result(trained, tmp_path):
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    one_round = run("train", *TINY, "--minutes", "1e-2", "--out", out, "--json", cwd=tmp_path)
-    assert last_json(one_round)["steps"] >= 1000
-    succeeded(run("train", *TINY, "--resume", "--out", out, cwd=tmp_path)
-              if (out / "checkpoint.npz").exists() else one_round)
+    for _ in range(20):  # a round at a time, until something has been learned
+        if fac.read_npz(out / "checkpoint.npz", ("checkpoint",))[0]["updates"]:
+            break
+        last_json(run("train", *TINY, "--minutes", "1e-2", "--out", out, "--json", cwd=tmp_path))
+    before = fac.read_npz(out / "checkpoint.npz", ("checkpoint",))[0]
+    assert before["updates"] > 0 and before["decisions"] < 3000
+    succeeded(run("train", *TINY, "--resume", "--out", out, cwd=tmp_path))
     for kind in ("expert", "student"):
         assert weights(out, kind) == weights(trained[1], kind)
 
@@ -129,6 +132,13 @@ def test_a_killed_run_goes_on_to_the_same_result(trained, tmp_path):
     (["--mlp-dim", "0"], ["mlp_dim", "at least 1"]),
     (["--distill-horizon", "3"], ["4 steps", "hold 3"]),
     (["--num-agents", "2"], ["[1, 3]"]),
+    (["--num-agents", "0"], ["[1, 3]"]),
+    (["--horizon", "501"], ["horizon", "500"]),
+    (["--updates-per-step", "inf"], ["updates_per_step", "finite"]),
+    (["--std-start", "3"], ["std_start", "2.0"]),
+    (["--distill-batch-size", "3"], ["--distill-batch-size"]),
+    (["--out", fac.__file__], ["can't be written"]),
+    (["--out", "x" * 300], ["can't be written"]),
     (["--evaluate-every", "0"], ["evaluate"]),
     (["--evaluate-episodes", "0"], ["evaluate"]),
     (["--episodes", "-1"], ["--episodes"]),
