@@ -2795,7 +2795,7 @@ def draw_prediction(path, prediction, robots):
         ax.set(yscale="log", ylabel=f"${function}$, ms")
         ax.grid(axis="y", alpha=0.3)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
-    axes[-1].set_xticks(range(len(robots)), [f"{r}, N = {ROBOTS[r][1]}" for r in robots])
+    axes[-1].set_xticks(range(len(robots)), [f"{r}\nN = {ROBOTS[r][1]}" for r in robots])
     save_figure(path, figure)
 
 
