@@ -768,7 +768,7 @@ class Learner:
     def __init__(self, sizes, config, rng, dtype=F32):
         model = WorldModel.create(sizes, rng, policy=True, dtype=dtype)
         policy = {k: v for k, v in model.params.items() if k.startswith("_pi")}
-        self.config, self.updates, self._arena = config, 0, Arena()
+        self.config, self._arena = config, Arena()
         self.optimizer = Optimizer({k: v for k, v in model.params.items() if k not in policy})
         self.policy_optimizer = Optimizer(policy)
         self.model = WorldModel(sizes, {**self.optimizer.params, **self.policy_optimizer.params})
@@ -794,10 +794,14 @@ class Learner:
         policy_loss(self.model, rollout, noise[:, steps:], config.lam,
                     self.policy_optimizer.grads, self._arena.empty)
         self.policy_optimizer.step(config.lr, config.grad_clip)
-        self.updates += 1
         if self.updates % config.target_every == 0:  # averages += tau (weights - averages)
             self.slow_vector += config.tau * (self.optimizer.vector - self.slow_vector)
         return terms, rollout
+
+    @property
+    def updates(self):
+        """Updates made so far."""
+        return self.optimizer.adam.t
 
 
 # ======================================================================================
@@ -897,7 +901,7 @@ class Distiller:
             raise UserError(f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, "
                             f"{replay.dim_action}), the expert expects ({sizes.dim_obs}, "
                             f"{sizes.dim_action}); pass the replay of the expert's task")
-        self.expert, self.config, self.seed, self.t = expert, config, seed, 0
+        self.expert, self.config, self.seed = expert, config, seed
         agents = sizes.dim_action if num_agents is None else num_agents
         self._threads = one_thread()  # until `close`, in this thread and the teacher's
         self.optimizer, self.student = new_student(expert, agents, config, seed)
@@ -926,13 +930,17 @@ class Distiller:
         losses = distill_loss(self.student, *batch, self.config, self.optimizer.grads,
                               self._arenas[0].empty)
         self.optimizer.step(learning_rate(self.config, self.t), self.config.grad_clip)
-        self.t += 1
         return losses
+
+    @property
+    def t(self):
+        """Steps made so far."""
+        return self.optimizer.adam.t
 
     def load(self, state):
         """Go on from the `state` of an optimizer."""
         self.optimizer.load(state)
-        self.t, self._next = self.optimizer.adam.t, None
+        self._next = None
 
     def close(self):
         """Stop the teacher's thread and give BLAS its threads back."""
@@ -2273,6 +2281,7 @@ class OnlineStudent:
         return losses
 
 
+TRAINING_DEFAULTS = {"batch_size": 256, "updates_per_step": 0.5}  # for a few cores
 TRAINING_BUDGET = {"samples": 128, "iterations": 4, "horizon": 3, "value_at": "after"}
 TRAINING_CURVE = ("decisions", "updates", "seconds", "std", "horizon", "return_mean", "return_min",
                   "return_max", "consistency", "reward", "value", "kl_reward", "kl_value",
@@ -2358,9 +2367,9 @@ class Training:
             if self.student:
                 tested["student"] = self.student.model
             default = PlannerConfig()
-            config = dataclasses.replace(self.planning, horizon=default.horizon,
-                                         value_at=default.value_at)
-            models.update({name: (model, config) for name, model in tested.items()})
+            testing = dataclasses.replace(self.planning, horizon=default.horizon,
+                                          value_at=default.value_at)
+            models.update({name: (model, testing) for name, model in tested.items()})
             jobs += [(name, seed, 0.0) for name in tested
                      for seed in episode_seeds(args.seed + 1, args.evaluate_episodes)]
         actors.start(models, jobs)
@@ -2413,7 +2422,6 @@ class Training:
             arrays[k] for k in ("observation", "action", "reward"))
         self.decisions, self.seconds, self.curve = (header[k] for k in ("decisions", "seconds",
                                                                         "curve"))
-        self.learner.updates = header["updates"]
 
 
 def lag(curve, fraction):
@@ -2442,12 +2450,13 @@ def command_train(args):
                         f"({planning.min_std}, {planning.max_std}), not {config.std_start}")
     if args.steps < quota:
         raise UserError(f"{args.envs} environments need at least {quota} steps, not {args.steps}")
+    decisions = args.steps // quota * quota  # whole rounds
+    total = int(config.updates_per_step * decisions)
     if not args.student:
         distilling = None
     else:
         args.num_agents = dim_action if args.num_agents is None else args.num_agents
-        total = max(1, int(config.updates_per_step * (args.steps // quota * quota)))
-        distilling = dataclasses.replace(distilling, steps=total)
+        distilling = dataclasses.replace(distilling, steps=max(1, total))
         if distilling.horizon + distilling.final_term > config.horizon:
             raise UserError(f"the student looks {distilling.horizon + distilling.final_term} steps "
                             f"ahead, the expert's batches hold {config.horizon}; lower "
@@ -2459,18 +2468,17 @@ def command_train(args):
     elif args.resume:
         raise UserError(f"{checkpoint}: no such file; there is nothing to resume")
     began = saved = time.time()
-    total = int(config.updates_per_step * (args.steps // quota * quota))
     with contextlib.closing(Actors(args.task, min(args.workers, args.envs))) as actors, \
             one_thread(), progress("training", total, "update", training.updates) as bar:
-        while training.decisions + quota <= args.steps:
+        while training.decisions < decisions:
             if args.minutes and time.time() - began > 60 * args.minutes:
                 break
             training.round(actors, bar)
             write_curve(out / "curve.csv", TRAINING_CURVE, training.curve)
-            if time.time() - saved > 60 or training.decisions + quota > args.steps:
+            if time.time() - saved > 60 or training.decisions == decisions:
                 write_npz(checkpoint, *training.state())
                 saved = time.time()
-        done = training.decisions + quota > args.steps
+        done = training.decisions == decisions
         if done:
             training.learn_until(total, bar)
         write_npz(checkpoint, *training.state())
@@ -2905,7 +2913,7 @@ def make_parser():
     sub.add_argument("--evaluate-every", type=natural, default=4_000, help="decisions between two "
                      "evaluations on the way [4000]")
     sub.add_argument("--evaluate-episodes", type=natural, default=4, help="episodes in one [4]")
-    add_config(sub, ExpertConfig, batch_size=256, updates_per_step=0.5)
+    add_config(sub, ExpertConfig, **TRAINING_DEFAULTS)
     add_config(sub, PlannerConfig, "MPPI while training", "plan-", **TRAINING_BUDGET)
     add_config(sub, DistillConfig, "The student (Algorithm 1), on the expert's batches and steps",
                "distill-", skip=("steps", "batch_size", "new_targets", "held_out"))
@@ -2946,7 +2954,7 @@ def main(argv=None):
                 from_args(config, args, **(paper_preset(config) if args.preset == "paper" else {}))
                 for config in (DistillConfig, PlannerConfig))
         elif args.command == "train":
-            args.configs = (from_args(ExpertConfig, args, batch_size=256, updates_per_step=0.5),
+            args.configs = (from_args(ExpertConfig, args, **TRAINING_DEFAULTS),
                             from_args(PlannerConfig, args, **TRAINING_BUDGET),
                             from_args(DistillConfig, args))
         else:

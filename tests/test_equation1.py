@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fac_tdmpc_ref as fac
-from test_golden import FORWARD, GRADIENT, NARROW, TASKS, assert_digest, relative
+from test_golden import FORWARD, GRADIENT, NARROW, TASKS, assert_digest, narrow_expert, relative
 from test_layers import assert_close, import_train_expert, numeric_gradient
 
 CONFIG = fac.ExpertConfig(latent_dim=3, enc_dim=5, mlp_dim=6, lam=0.7, batch_size=4,
@@ -77,19 +77,11 @@ def golden_case(source):
     """(model, target, arrays, training) of a golden file."""
     if source == "narrow":
         header, g = fac.read_npz(NARROW, ("golden",))
-        training = header["training"]
-        sizes = fac.ModelConfig(7, 6, 1, *(training[k] for k in ("latent_dim", "enc_dim",
-                                                                 "mlp_dim")))
-        models = []
-        for prefix in ("model ", "target "):
-            params = {k[len(prefix):]: v for k, v in g.items() if k.startswith(prefix)}
-            models.append(fac.WorldModel(sizes, {
-                k: v[None, :, None] if v.ndim == 1 else v[None] for k, v in params.items()}))
+        models = [narrow_expert(header, g, prefix) for prefix in ("model ", "target ")]
     else:
         header, g = fac.read_npz(fac.DATA / source / "golden.npz", ("golden",))
-        training, models = header["training"], [fac.load_model(fac.DATA / source / "expert.npz")[0]
-                                                ] * 2
-    return *models, g, fac.from_dict(fac.ExpertConfig, training, source)
+        models = [fac.load_model(fac.DATA / source / "expert.npz")[0]] * 2
+    return *models, g, fac.from_dict(fac.ExpertConfig, header["training"], source)
 
 
 @pytest.mark.parametrize("source", ["narrow", *TASKS])

@@ -166,17 +166,18 @@ def test_narrow_students(n, kind, dtype):
             assert relative(found, g[f"adam {key}"]) < ADAM, key
 
 
+def narrow_expert(header, g, prefix):
+    """The centralized model whose weights the narrow file keeps under a prefix."""
+    training = header["training"]
+    sizes = fac.ModelConfig(7, 6, 1, *(training[k] for k in ("latent_dim", "enc_dim", "mlp_dim")))
+    return fac.WorldModel(sizes, {
+        k[len(prefix):]: v[None, :, None] if v.ndim == 1 else v[None]
+        for k, v in g.items() if k.startswith(prefix)})
+
+
 def test_narrow_expert_forward():
     header, g = fac.read_npz(NARROW, ("golden",))
-    training = header["training"]
-    config = fac.ModelConfig(7, 6, 1, training["latent_dim"], training["enc_dim"],
-                             training["mlp_dim"])
-    params = {}
-    for key, value in g.items():
-        if key.startswith("model "):
-            norm = key.split(".")[1] == "1"
-            params[key[6:]] = value[None, :, None] if norm or key.endswith("bias") else value[None]
-    model = fac.WorldModel(config, params)
+    model = narrow_expert(header, g, "model ")
     z = model.encode(g["obs"][0])
     a = g["action"][0][None]
     q1, q2 = model.q(z, a)
