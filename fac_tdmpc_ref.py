@@ -2346,8 +2346,8 @@ class Training:
     def round(self, actors, bar):
         """Episodes and the updates they allow, side by side; adds a row to the curve.
 
-        Evaluations are of the weights at the round's start, as its episodes are, and plan with the
-        training budget and the default horizon.
+        Evaluations are of the weights at the round's start, as its episodes are: they belong to the
+        row before.
         """
         args, config = self.args, self.config
         quota = args.envs * EPISODE_STEPS
@@ -2361,17 +2361,10 @@ class Training:
             [args.seed, 2, first + i]).integers(2 ** 31)), std) for i in range(args.envs)]
         models = {"explore": (self.learner.model, dataclasses.replace(
             self.planning, min_std=std, horizon=horizon))}
-        tested = {}
         if not warming and self.decisions % args.evaluate_every < quota:
-            tested = {"expert": self.learner.model}
-            if self.student:
-                tested["student"] = self.student.model
-            default = PlannerConfig()
-            testing = dataclasses.replace(self.planning, horizon=default.horizon,
-                                          value_at=default.value_at)
-            models.update({name: (model, testing) for name, model in tested.items()})
-            jobs += [(name, seed, 0.0) for name in tested
-                     for seed in episode_seeds(args.seed + 1, args.evaluate_episodes)]
+            tested, tests = self.tests()
+            models.update(tested)
+            jobs += tests
         actors.start(models, jobs)
         losses += self.learn_until(due, bar, actors)
         began = time.time()
@@ -2381,15 +2374,39 @@ class Training:
             self.buffer.add(*episode)
         self.decisions += quota
         self.seconds += time.time() - began
-        played, tests = returns[:args.envs], [None, None]
-        if tested:
-            means = np.reshape(returns[args.envs:], (len(tested), -1)).mean(1)
-            tests[:len(tested)] = means.tolist()
+        played, tests = returns[:args.envs], self.tested(returns[args.envs:])
         self.curve.append([self.decisions, self.updates, round(self.seconds, 1), std, horizon,
                            float(np.mean(played)), min(played), max(played),
-                           *(np.mean(losses, 0).tolist() if losses else [None] * 5), *tests])
+                           *(np.mean(losses, 0).tolist() if losses else [None] * 5), None, None])
         bar.set_postfix_str(f"{self.decisions:,} decisions, return {np.mean(played):.0f}" + "".join(
-            f", {name} {r:.0f}" for name, r in zip(tested, tests)), False)
+            f", {name} {r:.0f}" for name, r in tests.items()), False)
+
+    def tests(self):
+        """An evaluation's ({name: (model, planner config)}, jobs), as Actors.start takes them.
+
+        It plans with the training budget and the default horizon.
+        """
+        default = PlannerConfig()
+        testing = dataclasses.replace(self.planning, horizon=default.horizon,
+                                      value_at=default.value_at)
+        models = {"expert": (self.learner.model, testing)}
+        if self.student:
+            models["student"] = self.student.model, testing
+        return models, [(name, seed, 0.0) for name in models for seed in episode_seeds(
+            self.args.seed + 1, self.args.evaluate_episodes)]
+
+    def tested(self, returns):
+        """Put an evaluation's returns, if any, into the last row; returns their means by name."""
+        means = np.reshape(returns, (-1, self.args.evaluate_episodes)).mean(1).tolist()
+        if means:
+            self.curve[-1][-2:] = (*means, None)[:2]
+        return dict(zip(("expert", "student"), means))
+
+    def finish(self, updates, actors, bar):
+        """The updates that are left, and an evaluation of what came out."""
+        self.learn_until(updates, bar)
+        actors.start(*self.tests())
+        self.tested([float(reward.sum()) for *_, reward in actors.collect()])
 
     def optimizers(self):
         """Everything that is learned, by name."""
@@ -2480,7 +2497,8 @@ def command_train(args):
                 saved = time.time()
         done = training.decisions == decisions
         if done:
-            training.learn_until(total, bar)
+            training.finish(total, actors, bar)
+            write_curve(out / "curve.csv", TRAINING_CURVE, training.curve)
         write_npz(checkpoint, *training.state())
     result = {"task": args.task, "seed": args.seed, "steps": training.decisions,
               "updates": training.updates, "seconds": round(training.seconds, 1), "done": done,

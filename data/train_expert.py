@@ -15,6 +15,7 @@ writes expert.npz, replay.npz and golden.npz into data/<task>/, and data/golden-
 import argparse
 import csv
 import dataclasses
+import functools
 import os
 import sys
 import time
@@ -32,14 +33,25 @@ import fac_tdmpc_ref as fac  # noqa: E402
 
 # --------------------------------------------------------------------------------- model
 
+class Output(nn.Linear):
+    """A last layer, in its weights' precision under autocast too.
+
+    bfloat16 keeps eight bits: a Q of 100 would be a multiple of a half.
+    """
+
+    def forward(self, x):
+        with torch.autocast(x.device.type, enabled=False):
+            return super().forward(x.to(self.weight.dtype))
+
+
 def mlp(dim_in, hidden, dim_out):
     return nn.Sequential(nn.Linear(dim_in, hidden), nn.ELU(), nn.Linear(hidden, hidden), nn.ELU(),
-                         nn.Linear(hidden, dim_out))
+                         Output(hidden, dim_out))
 
 
 def q_network(dim_in, hidden):
     return nn.Sequential(nn.Linear(dim_in, hidden), nn.LayerNorm(hidden), nn.Tanh(),
-                         nn.Linear(hidden, hidden), nn.ELU(), nn.Linear(hidden, 1))
+                         nn.Linear(hidden, hidden), nn.ELU(), Output(hidden, 1))
 
 
 class TOLD(nn.Module):
@@ -49,7 +61,7 @@ class TOLD(nn.Module):
         super().__init__()
         m, hidden = config.latent_dim, config.mlp_dim
         self._encoder = nn.Sequential(nn.Linear(dim_obs, config.enc_dim), nn.ELU(),
-                                      nn.Linear(config.enc_dim, m))
+                                      Output(config.enc_dim, m))
         self._dynamics = mlp(m + dim_action, hidden, m)
         self._reward = mlp(m + dim_action, hidden, 1)
         self._pi = mlp(m, hidden, dim_action)
@@ -112,8 +124,10 @@ def equation_1(model, target, obs, action, reward, config, pi_std):
 class Learner:
     """TOLD, its targets and its optimizers."""
 
-    def __init__(self, dim_obs, dim_action, config, device):
+    def __init__(self, dim_obs, dim_action, config, device, precision="float32"):
         self.config, self.updates = config, 0
+        self.autocast = functools.partial(torch.autocast, torch.device(device).type,
+                                          torch.bfloat16, enabled=precision == "bfloat16")
         self.model = TOLD(dim_obs, dim_action, config).to(device)
         self.target = TOLD(dim_obs, dim_action, config).to(device)
         self.target.load_state_dict(self.model.state_dict())
@@ -139,8 +153,9 @@ class Learner:
         """One step of Equation 1, one of the policy, and every second time the targets."""
         config = self.config
         self.optimizer.zero_grad(set_to_none=True)
-        consistency, reward_loss, value_loss, latents = equation_1(
-            self.model, self.target, obs, action, reward, config, pi_std)
+        with self.autocast():
+            consistency, reward_loss, value_loss, latents = equation_1(
+                self.model, self.target, obs, action, reward, config, pi_std)
         loss = (config.consistency_coef * consistency + config.reward_coef * reward_loss
                 + config.value_coef * value_loss) / len(action)
         loss.backward()
@@ -151,7 +166,8 @@ class Learner:
             p.requires_grad_(False)
         self.pi_optimizer.zero_grad(set_to_none=True)
         latents = latents.detach()
-        q = torch.minimum(*self.model.q(latents, self.model.pi(latents, pi_std)))
+        with self.autocast():
+            q = torch.minimum(*self.model.q(latents, self.model.pi(latents, pi_std)))
         weights = config.lam ** torch.arange(len(q), device=q.device, dtype=q.dtype)
         (-(q.mean(1) * weights).sum()).backward()
         nn.utils.clip_grad_norm_(self.model._pi.parameters(), config.grad_clip)
@@ -221,7 +237,7 @@ def train(args, config, planner):
         torch.set_num_threads(args.threads)
     _, _, dim_obs, dim_action = fac.lookup_task(args.task)
     rng = np.random.default_rng(args.seed)
-    learner = Learner(dim_obs, dim_action, config, args.device)
+    learner = Learner(dim_obs, dim_action, config, args.device, args.precision)
     replay = fac.ReplayBuffer(dim_obs, dim_action, config.buffer_size, config.buffer_dtype)
     decisions, seconds, elapsed, began = 0, 0.0, 0.0, time.time()
     out = Path(args.out)
@@ -272,7 +288,8 @@ def train(args, config, planner):
                 if warming:
                     action = rng.uniform(-1, 1, (args.envs, dim_action)).astype(np.float32)
                 else:
-                    action, mean = learner.plan(to_device(obs), mean, horizon, planner, std)
+                    with learner.autocast():
+                        action, mean = learner.plan(to_device(obs), mean, horizon, planner, std)
                     mean = torch.cat([mean[1:], torch.zeros_like(mean[:1])])
                     action = action.cpu().numpy()
                 obs, reward = pool.step(action)
@@ -339,6 +356,7 @@ def export(args, config, planner, learner, replay, decisions, minutes):
     weights = {k: v.cpu().numpy() for k, v in learner.model.state_dict().items()}
     about = {"task": args.task, "seed": args.seed, "decisions": decisions, "minutes": minutes,
              "updates": learner.updates, "torch": torch.__version__, "device": str(args.device),
+             "precision": args.precision,
              "training": dataclasses.asdict(config),
              "training_planner": dataclasses.asdict(planner)}
     fac.write_npz(folder / "expert.npz",
@@ -570,6 +588,8 @@ def main(argv=None):
                         help="processes that step them; 0 for none")
     parser.add_argument("--threads", type=int, default=0, help="PyTorch threads; 0: its default")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--precision", choices=("float32", "bfloat16"), default="float32",
+                        help="of hidden layers' products; weights and outputs stay float32")
     parser.add_argument("--minutes", type=float, default=0, help="stop after this time; 0: never")
     parser.add_argument("--out", default=None, help="checkpoint directory [runs/expert-<task>]")
     parser.add_argument("--data", default=None, help="where to export [this script's folder]")
