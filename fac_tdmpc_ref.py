@@ -1850,7 +1850,8 @@ def data_file(task, name):
     path = DATA / task / name
     if not path.exists():
         shipped = ", ".join(sorted(p.parent.name for p in DATA.glob("*/expert.npz"))) or "none"
-        raise UserError(f"{path}: no such file; experts are at hand for: {shipped}. Train one with "
+        raise UserError(f"{path}: no such file; experts are at hand for: {shipped} (the "
+                        f"repository holds them, a pip install doesn't). Train one with "
                         f"'python data/train_expert.py --task {task}' in a checkout of the "
                         f"repository, or name files with --expert and --replay")
     return path

@@ -8,7 +8,6 @@ Table 2's (512 samples, 6 iterations, horizon 3).
 """
 import argparse
 import contextlib
-import importlib.util
 import json
 import os
 import sys
@@ -208,9 +207,8 @@ def distillation(threads, turns):
 
 def training(threads, turns, batch=256):
     """(ratio, our ms, PyTorch's ms) of an update of Equation 1, policy and averages included."""
-    spec = importlib.util.spec_from_file_location("train_expert", fac.DATA / "train_expert.py")
-    train_expert = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(train_expert)
+    sys.path.insert(0, str(fac.DATA))
+    import train_expert
     config, rng = fac.ExpertConfig(batch_size=batch), np.random.default_rng(0)
     ours = fac.Learner(fac.ModelConfig(24, 6), config, rng)
     theirs = train_expert.Learner(24, 6, config, "cpu")

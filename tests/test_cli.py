@@ -339,7 +339,8 @@ def test_benchmark_measures_every_mode(tmp_path):
     done = run("benchmark", *flags, cwd=tmp_path)
     found = last_json(done)
     assert set(found) == {"prediction", "decision", "speedup", "handover_us", "cores"}
-    assert found["cores"] == os.cpu_count() and found["handover_us"] > 0
+    assert found["cores"] == os.cpu_count()
+    assert found["cores"] == 1 or found["handover_us"] > 0  # one core: no worker by default
     modes, functions = ("one-thread", "processes", "critical-path"), ("f_T", "f_R", "f_Q")
     rows = {(r["robot"], r["model"], r["function"], r["mode"]): r for r in found["prediction"]}
     assert set(rows) == {(robot, *subject) for robot in ("reacher", "hopper") for subject in (

@@ -1,5 +1,6 @@
 """Every backward pass against central differences in float64, and against live PyTorch."""
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
@@ -258,11 +259,9 @@ def test_adam_and_clipping_against_torch(size, lr, clip, seed):
 
 
 def import_train_expert():
-    import importlib.util
-    spec = importlib.util.spec_from_file_location("train_expert", fac.DATA / "train_expert.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    sys.path.insert(0, str(fac.DATA))
+    import train_expert
+    return train_expert
 
 
 def test_configs_refuse_nonsense():
