@@ -444,7 +444,7 @@ def test_data_file(tmp_path, monkeypatch):
     for task in ("walker-walk", "cheetah-run"):
         (tmp_path / task).mkdir()
         (tmp_path / task / "expert.npz").touch()
-    refusal(lambda: fac.data_file("fish-swim", "expert.npz"), "cheetah-run, walker-walk.")
+    refusal(lambda: fac.data_file("fish-swim", "expert.npz"), "cheetah-run, walker-walk (")
     found = fac.data_file("walker-walk", "expert.npz")
     assert found == tmp_path / "walker-walk" / "expert.npz"
     refusal(lambda: fac.data_file("walker-walk", "replay.npz"), "walker-walk/replay.npz")
