@@ -1942,24 +1942,29 @@ def _decisions(model, task, config, seeds, workers):
             ready = pool.ready()
 
 
-def measure_planning(planners, observations):
-    """Median milliseconds a decision of several planners, taken in turn so that noise is shared."""
-    seconds = [[] for _ in planners]
-    for i, obs in enumerate(observations):
-        for planner, times in zip(planners, seconds):
-            begin = time.perf_counter()
-            planner.act(obs)
-            if i >= 2:  # the first ones make buffers
-                times.append(time.perf_counter() - begin)
-    return [1e3 * float(np.median(times)) for times in seconds]
-
-
 def progress(label, total, unit, initial=0):
     """A progress bar on stderr with rate and remaining time."""
     from tqdm import tqdm
     return tqdm(desc=label, total=total, initial=initial, unit=unit, file=sys.stderr,
                 dynamic_ncols=True, smoothing=0.1,
                 mininterval=0.5 if sys.stderr.isatty() else 20)
+
+
+def take_turns(runs, turns, label):
+    """Seconds of functions that are called in turn, (turns, runs), so that noise hits all alike.
+
+    Also the seconds of one multiply-add in a product of 512 x 512 matrices, (turns,).
+    """
+    matrix, seconds = np.ones((512, 512), F32), np.zeros((turns, len(runs) + 1))
+    runs = [lambda: matrix @ matrix, *runs]
+    with progress(label, turns, "turn") as bar:
+        for turn in range(-1, turns):  # one more, which makes buffers
+            for i, run in enumerate(runs):
+                begin = time.perf_counter()
+                run()
+                seconds[turn, i] = time.perf_counter() - begin
+            bar.update(turn >= 0)
+    return seconds[:, 1:], seconds[:, 0] / 512 ** 3
 
 
 CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correlation_h0",
@@ -2137,10 +2142,12 @@ def command_distill(args):
     if not recorded:
         returns = evaluate(expert, args.task, planning, args.episodes, args.eval_seed, args.workers,
                            "evaluating the expert")["returns"]
-    rows = replay.observation[np.random.default_rng(0).choice(distiller.held_out_starts, 22)]
+    obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
     with Planner(expert, planning) as central, Planner(student, planning) as alone, \
             Planner(student, planning, workers=beside) as parallel:
-        ms = measure_planning([central, alone, parallel], rows.astype(F32))
+        timed, _ = take_turns([functools.partial(planner.act, obs) for planner in
+                               (central, alone, parallel)], 20, "timing")
+        ms = (1e3 * np.median(timed, 0)).tolist()
     if not beside or (args.plan_workers is None and ms[2] >= ms[1]):
         beside, ms[2] = 0, ms[1]  # handing over costs more than it saves
 
@@ -2642,23 +2649,6 @@ def multiply_adds(config, planner):
             for name, _, agents, widths in networks(config)}
     step, value = cost["_dynamics"] + cost["_reward"], cost["_Q1"] + cost["_Q2"]
     return planner.samples * planner.iterations * (planner.rewards * step + value)
-
-
-def take_turns(runs, turns, label):
-    """Seconds of functions that are called in turn, (turns, runs), so that noise hits all alike.
-
-    Also the seconds of one multiply-add in a product of 512 x 512 matrices, (turns,).
-    """
-    matrix, seconds = np.ones((512, 512), F32), np.zeros((turns, len(runs) + 1))
-    runs = [lambda: matrix @ matrix, *runs]
-    with progress(label, turns, "turn") as bar:
-        for turn in range(-1, turns):  # one more, which makes buffers
-            for i, run in enumerate(runs):
-                begin = time.perf_counter()
-                run()
-                seconds[turn, i] = time.perf_counter() - begin
-            bar.update(turn >= 0)
-    return seconds[:, 1:], seconds[:, 0] / 512 ** 3
 
 
 def benchmark_prediction(robot, workers, runs):
