@@ -1568,17 +1568,16 @@ def episode_seeds(seed, episodes):
     return [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(seed).spawn(episodes)]
 
 
-def hindsight(obs, reward, later, chosen, task):
-    """Move the target of reacher segments to where the finger is later in the episode.
+def move_target(obs, reward, back, chosen, task):
+    """Move the target of reacher segments back by `back` (B, 2) where chosen (B,), in place.
 
     The observation is (3 joints, 2 finger-to-target, 3 velocities) and the dynamics don't know
-    the target, so subtracting a later step's finger-to-target gives a true segment of an episode
-    with another target. Changes obs (H+1, B, 8) and reward (H, B) in place where chosen (B,);
-    later (B, 8) holds the later observations. The new reward is that of the decision's end for
-    all its repeated actions.
+    the target, so this gives a true segment of an episode with another target; `back` = a later
+    step's finger-to-target puts it where the finger is then. obs (H+1, B, 8), reward (H, B): the
+    new one is that of the decision's end for all its repeated actions.
     """
     radius = REACHER_TARGET[lookup_task(task)[1]] + FINGER_RADIUS
-    obs[:, chosen, 3:5] -= later[chosen, 3:5]
+    obs[:, chosen, 3:5] -= back[chosen]
     distance = np.linalg.norm(obs[1:, chosen, 3:5], axis=-1)
     reward[:, chosen] = ACTION_REPEAT * (distance <= radius)
 
@@ -1810,7 +1809,7 @@ class ReplayBuffer:
         self.count += 1
 
     def sample(self, rng, batch, steps, task):
-        """Segments drawn evenly, half of reacher's with a hindsight target [D6], float32.
+        """Segments drawn evenly, float32; two thirds of reacher's with another target [D6].
 
         Returns observations (H + 1, O, B), actions (H, A, B) and rewards (H, B).
         """
@@ -1821,8 +1820,10 @@ class ReplayBuffer:
         action = self.action[episode, rows[:-1]].astype(F32)
         reward = self.reward[episode, rows[:-1]]
         if task.startswith("reacher"):
-            later = self.observation[episode, rng.integers(start + 1, EPISODE_STEPS + 1)]
-            hindsight(obs, reward, later.astype(F32), rng.random(batch) < 0.5, task)
+            later = self.observation[episode, rng.integers(start + 1, EPISODE_STEPS + 1), 3:5]
+            moved, fresh = rng.random((2, batch)) < [[2 / 3], [1 / 2]]
+            back = np.where(fresh, obs[0, :, 3:5].T - new_targets(obs[0].T, rng), later.T).T
+            move_target(obs, reward, back.astype(F32), moved, task)
         return obs.swapaxes(1, 2), action.swapaxes(1, 2), reward
 
     def write(self, path, header):
@@ -2921,7 +2922,7 @@ def make_parser():
                      "with MPPI's default budget; 0: none [20]")
     sub.add_argument("--evaluate-every", type=natural, default=4_000, help="decisions between two "
                      "evaluations on the way [4000]")
-    sub.add_argument("--evaluate-episodes", type=natural, default=4, help="episodes in one [4]")
+    sub.add_argument("--evaluate-episodes", type=natural, default=10, help="episodes in one [4]")
     add_config(sub, ExpertConfig, **TRAINING_DEFAULTS)
     add_config(sub, PlannerConfig, "MPPI while training", "plan-", **TRAINING_BUDGET)
     add_config(sub, DistillConfig, "The student (Algorithm 1), on the expert's batches and steps",

@@ -42,7 +42,7 @@ def test_the_buffer_drops_the_oldest_and_writes_a_replay(tmp_path, dtype):
     assert np.allclose(replay.action[:500], buffer.action[1], atol=1e-3)
 
 
-def test_segments_are_in_order_and_hindsight_moves_half_of_them():
+def test_segments_are_in_order_and_two_thirds_get_other_targets():
     rng = np.random.default_rng(1)
     buffer = fac.ReplayBuffer(8, 3, fac.EPISODE_STEPS)
     walk = np.cumsum(rng.standard_normal((501, 8)) * 0.1 + 1, 0).astype(np.float32)
@@ -53,8 +53,15 @@ def test_segments_are_in_order_and_hindsight_moves_half_of_them():
     for h in range(4):
         assert np.allclose(obs[h][untouched], walk[np.add(starts, h)].T[untouched])
     moved = ~np.isclose(obs[0, 3], walk[starts, 3])
-    assert 0.4 < moved.mean() < 0.6
+    assert 0.58 < moved.mean() < 0.75
     assert not reward[:, ~moved].any() and reward[:, moved].any()
+    # hindsight moves the target by a later finger-to-target of the episode, fresh ones are near 0
+    back = walk[starts, 3] - obs[0, 3]
+    hindsight = np.isclose(back[:, None], walk[:, 3], atol=1e-4).any(1)
+    finger = fac.REACHER_LINK * np.cos(np.cumsum(obs[0, :3], 0)).sum(0)
+    fresh = moved & (np.abs(finger + obs[0, 3]) <= 0.2 + 1e-4)
+    assert 0.25 < (moved & hindsight).mean() < 0.42 and 0.25 < fresh.mean() < 0.42
+    assert (hindsight | fresh)[moved].all()
 
 
 @pytest.fixture(scope="module")
