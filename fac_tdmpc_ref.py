@@ -2922,7 +2922,7 @@ def make_parser():
                      "with MPPI's default budget; 0: none [20]")
     sub.add_argument("--evaluate-every", type=natural, default=4_000, help="decisions between two "
                      "evaluations on the way [4000]")
-    sub.add_argument("--evaluate-episodes", type=natural, default=10, help="episodes in one [4]")
+    sub.add_argument("--evaluate-episodes", type=natural, default=10, help="episodes in one [10]")
     add_config(sub, ExpertConfig, **TRAINING_DEFAULTS)
     add_config(sub, PlannerConfig, "MPPI while training", "plan-", **TRAINING_BUDGET)
     add_config(sub, DistillConfig, "The student (Algorithm 1), on the expert's batches and steps",
