@@ -1954,6 +1954,7 @@ def progress(label, total, unit, initial=0):
 def take_turns(runs, turns, label):
     """Seconds of functions that are called in turn, (turns, runs), so that noise hits all alike.
 
+    Call it under `one_thread`: idle BLAS threads would keep a core from the worker processes.
     Also the seconds of one multiply-add in a product of 512 x 512 matrices, (turns,).
     """
     matrix, seconds = np.ones((512, 512), F32), np.zeros((turns, len(runs) + 1))
@@ -2144,7 +2145,7 @@ def command_distill(args):
         returns = evaluate(expert, args.task, planning, args.episodes, args.eval_seed, args.workers,
                            "evaluating the expert")["returns"]
     obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
-    with Planner(expert, planning) as central, Planner(student, planning) as alone, \
+    with one_thread(), Planner(expert, planning) as central, Planner(student, planning) as alone, \
             Planner(student, planning, workers=beside) as parallel:
         timed, _ = take_turns([functools.partial(planner.act, obs) for planner in
                                (central, alone, parallel)], 20, "timing")
