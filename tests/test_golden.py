@@ -95,7 +95,8 @@ def ten_steps(student, batch, config, lr, losses, check_gradients=lambda grads: 
     for step, expected in enumerate(losses):
         gradient[:] = 0
         loss, _, _ = fac.distill_loss(student, *batch, config, grads)
-        assert abs(loss / expected - 1) < ADAM
+        # in float32 the rounding of Q stays while the loss falls: measured by the first loss there
+        assert abs(loss - expected) < ADAM * (losses[0] if vector.dtype == np.float32 else expected)
         if step == 0:
             check_gradients(grads)
         clipped &= fac.clip_norm(gradient, config.grad_clip) > config.grad_clip
