@@ -138,6 +138,24 @@ def test_ten_updates_are_pytorch_s(dtype, tolerance):
             assert_close(value.ravel(), params[key].detach().numpy().ravel(), tolerance)
 
 
+@pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="needs PyTorch")
+def test_half_precision_ends_at_the_last_layer():
+    import torch
+    train_expert = import_train_expert()
+    torch.manual_seed(0)
+    model = train_expert.TOLD(4, 2, CONFIG)
+    torch.nn.init.normal_(model._Q1[-1].weight)
+    z, a = torch.randn(50, CONFIG.latent_dim), torch.randn(50, 2)
+    learner = train_expert.Learner(4, 2, CONFIG, "cpu", "bfloat16")
+    with torch.no_grad(), learner.autocast():
+        half = model.q(z, a)[0] + 100
+        half -= 100
+    with torch.no_grad():
+        whole = model.q(z, a)[0]
+    assert half.dtype == torch.float32
+    assert 0 < (half - whole).abs().max() < 0.03 * whole.std()  # bfloat16's steps at 100 are 0.5
+
+
 def test_the_averages_follow_every_second_update():
     rng = np.random.default_rng(4)
     learner = small_learner(rng, np.float32)
