@@ -1954,12 +1954,12 @@ def progress(label, total, unit, initial=0):
 def take_turns(runs, turns, label):
     """Seconds of functions that are called in turn, (turns, runs), so that noise hits all alike.
 
-    Call it under `one_thread`: idle BLAS threads would keep a core from the worker processes.
-    Also the seconds of one multiply-add in a product of 512 x 512 matrices, (turns,).
+    BLAS has one thread meanwhile: idle ones would keep a core from the worker processes. Also the
+    seconds of one multiply-add in a product of 512 x 512 matrices, (turns,).
     """
     matrix, seconds = np.ones((512, 512), F32), np.zeros((turns, len(runs) + 1))
     runs = [lambda: matrix @ matrix, *runs]
-    with progress(label, turns, "turn") as bar:
+    with one_thread(), progress(label, turns, "turn") as bar:
         for turn in range(-1, turns):  # one more, which makes buffers
             for i, run in enumerate(runs):
                 begin = time.perf_counter()
@@ -2145,7 +2145,7 @@ def command_distill(args):
         returns = evaluate(expert, args.task, planning, args.episodes, args.eval_seed, args.workers,
                            "evaluating the expert")["returns"]
     obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
-    with one_thread(), Planner(expert, planning) as central, Planner(student, planning) as alone, \
+    with Planner(expert, planning) as central, Planner(student, planning) as alone, \
             Planner(student, planning, workers=beside) as parallel:
         timed, _ = take_turns([functools.partial(planner.act, obs) for planner in
                                (central, alone, parallel)], 20, "timing")
@@ -2379,12 +2379,12 @@ class Training:
         losses += self.learn_until(due, bar, actors)
         began = time.time()
         episodes = actors.collect()
-        returns = [float(reward.sum()) for *_, reward in episodes]
         for episode in episodes[:args.envs]:
             self.buffer.add(*episode)
         self.decisions += quota
         self.seconds += time.time() - began
-        played, tests = returns[:args.envs], self.tested(returns[args.envs:])
+        played = [float(reward.sum()) for *_, reward in episodes[:args.envs]]
+        tests = self.tested(episodes[args.envs:])
         self.curve.append([self.decisions, self.updates, round(self.seconds, 1), std, horizon,
                            float(np.mean(played)), min(played), max(played),
                            *(np.mean(losses, 0).tolist() if losses else [None] * 5), None, None])
@@ -2405,8 +2405,9 @@ class Training:
         return models, [(name, seed, 0.0) for name in models for seed in episode_seeds(
             self.args.seed + 1, self.args.evaluate_episodes)]
 
-    def tested(self, returns):
+    def tested(self, episodes):
         """Put an evaluation's returns, if any, into the last row; returns their means by name."""
+        returns = [float(reward.sum()) for *_, reward in episodes]
         means = np.reshape(returns, (-1, self.args.evaluate_episodes)).mean(1).tolist()
         if means:
             self.curve[-1][-2:] = (*means, None)[:2]
@@ -2416,7 +2417,7 @@ class Training:
         """The updates that are left, and an evaluation of what came out."""
         self.learn_until(updates, bar)
         actors.start(*self.tests())
-        self.tested([float(reward.sum()) for *_, reward in actors.collect()])
+        self.tested(actors.collect())
 
     def optimizers(self):
         """Everything that is learned, by name."""
@@ -2753,15 +2754,14 @@ def command_benchmark(args):
     if args.figure:
         pyplot()  # before the work, not after it
     prediction, decision, hand_overs = [], [], []
-    with one_thread():
-        for robot in args.robots:
-            agents = ROBOTS[robot][1]
-            workers = (useful_workers(agents) if args.workers is None
-                       else min(args.workers, agents - 1))
-            prediction += benchmark_prediction(robot, workers, args.runs)
-            rows, hand_over = benchmark_decisions(robot, workers, planning, args.runs // 10)
-            decision += rows
-            hand_overs += [hand_over] * (hand_over is not None)
+    for robot in args.robots:
+        agents = ROBOTS[robot][1]
+        workers = (useful_workers(agents) if args.workers is None
+                   else min(args.workers, agents - 1))
+        prediction += benchmark_prediction(robot, workers, args.runs)
+        rows, hand_over = benchmark_decisions(robot, workers, planning, args.runs // 10)
+        decision += rows
+        hand_overs += [hand_over] * (hand_over is not None)
     result = {"prediction": prediction, "decision": decision,
               "speedup": speedups(prediction, decision, planning),
               "handover_us": float(np.median(hand_overs)) if hand_overs else None,

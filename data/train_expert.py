@@ -356,8 +356,7 @@ def export(args, config, planner, learner, replay, decisions, minutes):
     weights = {k: v.cpu().numpy() for k, v in learner.model.state_dict().items()}
     about = {"task": args.task, "seed": args.seed, "decisions": decisions, "minutes": minutes,
              "updates": learner.updates, "torch": torch.__version__, "device": str(args.device),
-             "precision": args.precision,
-             "training": dataclasses.asdict(config),
+             "precision": args.precision, "training": dataclasses.asdict(config),
              "training_planner": dataclasses.asdict(planner)}
     fac.write_npz(folder / "expert.npz",
                   {"kind": "expert", "model": dataclasses.asdict(sizes), **about}, weights)

@@ -7,7 +7,7 @@ import pytest
 
 import fac_tdmpc_ref as fac
 from test_golden import FORWARD, GRADIENT, NARROW, TASKS, assert_digest, narrow_expert, relative
-from test_layers import assert_close, import_train_expert, numeric_gradient
+from test_layers import assert_close, numeric_gradient
 
 CONFIG = fac.ExpertConfig(latent_dim=3, enc_dim=5, mlp_dim=6, lam=0.7, batch_size=4,
                           consistency_coef=1.5, value_coef=0.3)
@@ -112,7 +112,7 @@ def test_golden_loss_and_gradients(source):
 def test_ten_updates_are_pytorch_s(dtype, tolerance):
     """Adam divides a gradient by its own size: in float32, rounding moves small ones visibly."""
     import torch
-    train_expert = import_train_expert()
+    import train_expert
     rng = np.random.default_rng(3)
     ours = small_learner(rng, dtype)
     config = dataclasses.replace(CONFIG, grad_clip=0.5, tau=0.1)
@@ -141,7 +141,7 @@ def test_ten_updates_are_pytorch_s(dtype, tolerance):
 @pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="needs PyTorch")
 def test_half_precision_ends_at_the_last_layer():
     import torch
-    train_expert = import_train_expert()
+    import train_expert
     torch.manual_seed(0)
     model = train_expert.TOLD(4, 2, CONFIG)
     torch.nn.init.normal_(model._Q1[-1].weight)

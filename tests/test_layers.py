@@ -1,6 +1,5 @@
 """Every backward pass against central differences in float64, and against live PyTorch."""
 import dataclasses
-import sys
 
 import numpy as np
 import pytest
@@ -199,7 +198,7 @@ shapes = st.tuples(st.integers(1, 4), st.integers(1, 7), st.integers(2, 8), st.i
 @given(shapes, st.integers(0, 2 ** 31))
 def test_networks_against_torch(shape, seed):
     torch = pytest.importorskip("torch")
-    train_expert = import_train_expert()
+    import train_expert
     n, inputs, hidden, batch = shape
     rng = np.random.default_rng(seed)
     config = fac.ModelConfig(3, n * 2, n, inputs, 5, hidden)
@@ -227,7 +226,7 @@ def test_networks_against_torch(shape, seed):
        st.sampled_from(["forward", "reverse"]), st.integers(0, 2 ** 31))
 def test_distill_loss_against_torch(n, batch, steps, kind, seed):
     torch = pytest.importorskip("torch")
-    train_expert = import_train_expert()
+    import train_expert
     student, features, actions, targets, config = small_case(n, batch, steps, kind,
                                                              np.random.default_rng(seed))
     theirs = {k: torch.tensor(v, requires_grad=True) for k, v in student.params.items()}
@@ -256,12 +255,6 @@ def test_adam_and_clipping_against_torch(size, lr, clip, seed):
         fac.clip_norm(gradient, clip)
         adam.step(ours, gradient, lr)
         assert np.allclose(ours, theirs.detach().numpy(), rtol=1e-9, atol=1e-12)
-
-
-def import_train_expert():
-    sys.path.insert(0, str(fac.DATA))
-    import train_expert
-    return train_expert
 
 
 def test_configs_refuse_nonsense():
