@@ -1254,6 +1254,15 @@ class Planner:
             self._workers.send(i, seeds[share])
         self._own.reset(seeds[self._shares[0]])
 
+    @property
+    def warm_start(self):
+        """What an episode hands to its next decision, where all is planned in this process."""
+        return self._own.mean, self._own.rngs
+
+    @warm_start.setter
+    def warm_start(self, state):
+        self._own.mean, self._own.rngs = state
+
     def act(self, obs):
         """obs (O,), anything that converts to float32 -> action (A,) float32 in [-1, 1]."""
         obs = np.asarray(obs, F32)
@@ -1809,7 +1818,7 @@ class ReplayBuffer:
         self.count += 1
 
     def sample(self, rng, batch, steps, task):
-        """Segments drawn evenly, float32; two thirds of reacher's with another target [D6].
+        """Segments drawn evenly, float32; three quarters of reacher's with another target [D6].
 
         Returns observations (H + 1, O, B), actions (H, A, B) and rewards (H, B).
         """
@@ -1821,7 +1830,7 @@ class ReplayBuffer:
         reward = self.reward[episode, rows[:-1]]
         if task.startswith("reacher"):
             later = self.observation[episode, rng.integers(start + 1, EPISODE_STEPS + 1), 3:5]
-            moved, fresh = rng.random((2, batch)) < [[2 / 3], [1 / 2]]
+            moved, fresh = rng.random((2, batch)) < [[3 / 4], [1 / 3]]
             back = np.where(fresh, obs[0, :, 3:5].T - new_targets(obs[0].T, rng), later.T).T
             move_target(obs, reward, back.astype(F32), moved, task)
         return obs.swapaxes(1, 2), action.swapaxes(1, 2), reward
@@ -2202,70 +2211,104 @@ def print_table(rows):
                         for i, (cell, w) in enumerate(zip(row, widths))))
 
 
-def explore(environment, planner, seed, std):
-    """One training episode: observations (T + 1, O), actions (T, A), rewards (T,).
+class Exploration:
+    """A training episode, played in parts so that each can plan with newer weights.
 
-    The planner's actions with Gaussian noise of deviation `std` added, as TD-MPC explores; without
-    a planner, actions drawn evenly. Depends on the planner's model and the seed alone.
+    `observation` (T + 1, O), `action` (T, A) and `reward` (T,) grow as lists. They depend on the
+    seed and on the models it was played with.
     """
-    rng = np.random.default_rng([seed, 1])
-    observation, action, reward = [environment.reset(seed)], [], []
-    if planner:
-        planner.reset(seed)
-    for _ in range(EPISODE_STEPS):
-        if planner:
-            a = planner.act(observation[-1])
-            a = np.clip(a + std * rng.standard_normal(a.shape, F32), -1, 1)
-        else:
-            a = rng.uniform(-1, 1, environment.dim_action).astype(F32)
-        obs, r = environment.step(a)
-        observation.append(obs)
-        action.append(a)
-        reward.append(r)
-    return np.stack(observation), np.stack(action), np.array(reward, F32)
+
+    def __init__(self, environment, seed, std):
+        self.environment, self.seed, self.std = environment, seed, std
+        self.rng, self.warm_start = np.random.default_rng([seed, 1]), None
+        self.observation, self.action, self.reward = [environment.reset(seed)], [], []
+
+    def play(self, planner, decisions):
+        """Go on with a planner, whose actions get noise of deviation `std`, or None: at random."""
+        if planner and self.warm_start:
+            planner.warm_start = self.warm_start
+        elif planner:
+            planner.reset(self.seed)
+        for _ in range(decisions):
+            if planner:
+                action = planner.act(self.observation[-1])
+                noise = self.std * self.rng.standard_normal(action.shape, F32)
+                action = np.clip(action + noise, -1, 1)
+            else:
+                action = self.rng.uniform(-1, 1, self.environment.dim_action).astype(F32)
+            obs, reward = self.environment.step(action)
+            self.observation.append(obs)
+            self.action.append(action)
+            self.reward.append(reward)
+        self.warm_start = planner and planner.warm_start
 
 
 def _acting_worker(connection):
+    """Plays what `Actors` sends: of the tests, in each part, its share of the episodes' length."""
     task = connection.recv()
-    models, jobs = connection.recv()  # before anything can fail: the parent waits until it is read
-    environment = Environment(task)
+    message = connection.recv()  # before anything can fail: the parent waits until it is read
+    environments, testing = [], Environment(task)
     while True:
-        planners = {name: Planner(WorldModel(*model), config)
-                    for name, (*model, config) in models.items()}
-        for name, seed, std in jobs:
-            connection.send(explore(environment, planners.get(name), seed, std))
-        models, jobs = connection.recv()
+        command, *values = message
+        if command == "begin":
+            seeds, std, models, tests = values
+            environments += [Environment(task) for _ in seeds[len(environments):]]
+            episodes = [Exploration(e, seed, std) for e, seed in zip(environments, seeds)]
+            planners = {name: _planner(*model) for name, model in models.items()}
+            played, returns = 0, []
+        elif command == "play":
+            model, decisions = values
+            planner = model and _planner(*model)
+            for episode in episodes:
+                episode.play(planner, decisions)
+            played += decisions
+            for name, seed in tests[len(returns):len(tests) * played // EPISODE_STEPS]:
+                returns.append(sum(r for r, _ in run_episode(testing, planners[name], seed)))
+            connection.send(None)
+        else:
+            connection.send(([(np.stack(e.observation), np.stack(e.action),
+                               np.array(e.reward, F32)) for e in episodes], returns))
+        message = connection.recv()
+
+
+def _planner(model_config, params, config):
+    return Planner(WorldModel(model_config, params), config)
 
 
 class Actors:
-    """Processes that act out episodes while this one learns."""
+    """Processes that play episodes, part by part, while this one learns."""
 
     def __init__(self, task, workers):
         lookup_task(task)
         self._workers, self._count = Workers(_acting_worker, workers, "acting worker"), workers
         self._workers.send_all(task)
 
-    def start(self, models, jobs):
-        """models: {name: (model, planner config)}; jobs: (name, or None for random; seed; std)."""
+    def begin(self, seeds, std, models, tests):
+        """Start a training episode for each seed, with exploration noise of deviation std.
+
+        Beside them go whole episodes without noise: tests (name, seed), with the weights that
+        models {name: (model, planner config)} have now.
+        """
         models = {name: (model.config, model.params, config)
                   for name, (model, config) in models.items()}
-        self._shares = [jobs[i::self._count] for i in range(self._count)]
-        self._arrived = [[] for _ in self._shares]
-        for i, share in enumerate(self._shares):
-            self._workers.send(i, (models, share))
+        for i in range(self._count):
+            self._workers.send(i, ("begin", seeds[i::self._count], std, models,
+                                   tests[i::self._count]))
 
-    def drain(self):
-        """Take what has arrived, so that no actor waits for a full pipe."""
-        for i in self._workers.ready(timeout=0):
-            self._arrived[i].append(self._workers.receive(i))
+    def play(self, decisions, model=None, config=None):
+        """Let the episodes go on by so many decisions, planned with a model or at random."""
+        self._workers.send_all(("play", model and (model.config, model.params, config), decisions))
+
+    def wait(self):
+        """Until they have."""
+        self._workers.receive_all()
 
     def collect(self):
-        """What `explore` gave for every job, in their order."""
-        for i, share in enumerate(self._shares):
-            while len(self._arrived[i]) < len(share):
-                self._arrived[i].append(self._workers.receive(i))
-        return [self._arrived[i % self._count][i // self._count]
-                for i in range(sum(map(len, self._shares)))]
+        """(observations, actions, rewards) of every episode, and the tests' returns."""
+        self._workers.send_all(("collect",))
+        shares = self._workers.receive_all()
+        return [[shares[i % self._count][part][i // self._count]
+                 for i in range(sum(len(share[part]) for share in shares))] for part in (0, 1)]
 
     def close(self):
         """End the processes."""
@@ -2291,7 +2334,9 @@ class OnlineStudent:
         return losses
 
 
-TRAINING_DEFAULTS = {"batch_size": 256, "updates_per_step": 0.5}  # for a few cores
+# for a few cores; hidden layers of 512, as in Table 2, make an update three times as dear
+TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}
+FOLLOWING_DEFAULTS = {"noise_samples": 3}
 TRAINING_BUDGET = {"samples": 128, "iterations": 4, "horizon": 3, "value_at": "after"}
 TRAINING_CURVE = ("decisions", "updates", "seconds", "std", "horizon", "return_mean", "return_min",
                   "return_max", "consistency", "reward", "value", "kl_reward", "kl_value",
@@ -2301,7 +2346,7 @@ TRAINING_CURVE = ("decisions", "updates", "seconds", "std", "horizon", "return_m
 class Training:
     """An expert that learns (Equation 1), the student that may follow it, and their replay.
 
-    Rounds: while the actors play `envs` episodes with the weights of the round's start, the
+    Rounds: while the actors play `envs` episodes, with new weights every `refresh` decisions, the
     learner makes the updates that the decisions so far allow. Everything depends on the seed, not
     on the number of workers, and all of it is in `state`.
     """
@@ -2319,8 +2364,9 @@ class Training:
         self.decisions, self.seconds, self.curve = 0, 0.0, []
         self.settings = {
             "task": args.task, "seed": args.seed, "envs": args.envs, "steps": args.steps,
-            "evaluate_every": args.evaluate_every, "config": dataclasses.asdict(config),
-            "planner": dataclasses.asdict(planning), "num_agents": args.num_agents,
+            "refresh": args.refresh, "evaluate_every": args.evaluate_every,
+            "config": dataclasses.asdict(config), "planner": dataclasses.asdict(planning),
+            "num_agents": args.num_agents,
             "distill": distilling and dataclasses.asdict(distilling)}
 
     @property
@@ -2336,15 +2382,12 @@ class Training:
         kl = self.student.update(obs[0], actions)[1:] if self.student else (0.0, 0.0)
         return *terms, *kl
 
-    def learn_until(self, updates, bar, actors=None):
+    def learn_until(self, updates, bar):
         """Updates until there were so many; returns their losses."""
-        began, losses = time.time(), []
+        losses = []
         while self.updates < updates:
             losses.append(self.learn())
             bar.update()
-            if actors:
-                actors.drain()
-        self.seconds += time.time() - began
         return losses
 
     @property
@@ -2356,35 +2399,33 @@ class Training:
     def round(self, actors, bar):
         """Episodes and the updates they allow, side by side; adds a row to the curve.
 
-        Evaluations are of the weights at the round's start, as its episodes are: they belong to the
-        row before.
+        Evaluations are of the weights at the round's start: they belong to the row before.
         """
-        args, config = self.args, self.config
+        args, config, began = self.args, self.config, time.time()
         quota = args.envs * EPISODE_STEPS
         horizon = int(np.interp(self.decisions, [0, config.std_steps], [1, self.planning.horizon]))
         first, std = self.decisions // EPISODE_STEPS, self.std
         warming = self.decisions < config.seed_decisions
+        exploring = () if warming else (self.learner.model, dataclasses.replace(
+            self.planning, min_std=std, horizon=horizon))
+        start = 0 if warming else int(config.updates_per_step * (self.decisions - quota))
         due = 0 if warming else int(config.updates_per_step * self.decisions)
         # the random episodes' updates come before the first planned episode
-        losses = self.learn_until(due - int(config.updates_per_step * quota), bar)
-        jobs = [(None if warming else "explore", int(np.random.default_rng(
-            [args.seed, 2, first + i]).integers(2 ** 31)), std) for i in range(args.envs)]
-        models = {"explore": (self.learner.model, dataclasses.replace(
-            self.planning, min_std=std, horizon=horizon))}
-        if not warming and self.decisions % args.evaluate_every < quota:
-            tested, tests = self.tests()
-            models.update(tested)
-            jobs += tests
-        actors.start(models, jobs)
-        losses += self.learn_until(due, bar, actors)
-        began = time.time()
-        episodes = actors.collect()
-        for episode in episodes[:args.envs]:
+        losses = self.learn_until(start, bar)
+        tested = not warming and self.decisions % args.evaluate_every < quota
+        actors.begin([int(np.random.default_rng([args.seed, 2, first + i]).integers(2 ** 31))
+                      for i in range(args.envs)], std, *(self.tests() if tested else ({}, [])))
+        for played in range(0, EPISODE_STEPS, args.refresh):
+            end = min(played + args.refresh, EPISODE_STEPS)
+            actors.play(end - played, *exploring)
+            losses += self.learn_until(start + (due - start) * end // EPISODE_STEPS, bar)
+            actors.wait()
+        episodes, returns = actors.collect()
+        for episode in episodes:
             self.buffer.add(*episode)
         self.decisions += quota
         self.seconds += time.time() - began
-        played = [float(reward.sum()) for *_, reward in episodes[:args.envs]]
-        tests = self.tested(episodes[args.envs:])
+        tests, played = self.tested(returns), [float(reward.sum()) for *_, reward in episodes]
         self.curve.append([self.decisions, self.updates, round(self.seconds, 1), std, horizon,
                            float(np.mean(played)), min(played), max(played),
                            *(np.mean(losses, 0).tolist() if losses else [None] * 5), None, None])
@@ -2392,7 +2433,7 @@ class Training:
             f", {name} {r:.0f}" for name, r in tests.items()), False)
 
     def tests(self):
-        """An evaluation's ({name: (model, planner config)}, jobs), as Actors.start takes them.
+        """An evaluation's models and tests, as Actors.begin takes them.
 
         It plans with the training budget and the default horizon.
         """
@@ -2402,12 +2443,11 @@ class Training:
         models = {"expert": (self.learner.model, testing)}
         if self.student:
             models["student"] = self.student.model, testing
-        return models, [(name, seed, 0.0) for name in models for seed in episode_seeds(
+        return models, [(name, seed) for name in models for seed in episode_seeds(
             self.args.seed + 1, self.args.evaluate_episodes)]
 
-    def tested(self, episodes):
+    def tested(self, returns):
         """Put an evaluation's returns, if any, into the last row; returns their means by name."""
-        returns = [float(reward.sum()) for *_, reward in episodes]
         means = np.reshape(returns, (-1, self.args.evaluate_episodes)).mean(1).tolist()
         if means:
             self.curve[-1][-2:] = (*means, None)[:2]
@@ -2415,9 +2455,13 @@ class Training:
 
     def finish(self, updates, actors, bar):
         """The updates that are left, and an evaluation of what came out."""
+        began = time.time()
         self.learn_until(updates, bar)
-        actors.start(*self.tests())
-        self.tested(actors.collect())
+        actors.begin([], 0.0, *self.tests())
+        actors.play(EPISODE_STEPS)
+        actors.wait()
+        self.tested(actors.collect()[1])
+        self.seconds += time.time() - began
 
     def optimizers(self):
         """Everything that is learned, by name."""
@@ -2470,7 +2514,7 @@ def command_train(args):
     config, planning, distilling = args.configs
     _, _, _, dim_action = lookup_task(args.task)
     quota = args.envs * EPISODE_STEPS
-    for name in ("envs", "workers", "evaluate_every", "evaluate_episodes"):
+    for name in ("envs", "refresh", "workers", "evaluate_every", "evaluate_episodes"):
         if getattr(args, name) < 1:
             raise UserError(f"{name} must be at least 1, not {getattr(args, name)}")
     if not planning.min_std <= config.std_start <= planning.max_std:
@@ -2905,14 +2949,15 @@ def make_parser():
                   epilog="A run that was cut off goes on when the same command is given again. Its "
                   "folder is what distill takes as --expert.")
     sub.add_argument("--task", default="reacher-easy", help="one of: " + ", ".join(TASKS))
-    sub.add_argument("--steps", type=natural, default=50_000,
-                     help="decisions, two environment steps each [50000]")
+    sub.add_argument("--steps", type=natural, default=30_000,
+                     help="decisions, two environment steps each [30000]")
     sub.add_argument("--seed", type=natural, default=0, help="[0]")
     sub.add_argument("--student", choices=("fac",), help="fac: after each update of the expert, "
                      "one of a factored student on the same batch")
     sub.add_argument("--num-agents", type=int, help="the student's N [dim(A)]")
-    sub.add_argument("--envs", type=natural, default=4, help="episodes in a round, all with the "
-                     "weights of its start [4]")
+    sub.add_argument("--envs", type=natural, default=4, help="episodes in a round [4]")
+    sub.add_argument("--refresh", type=natural, default=25, help="decisions that an episode goes "
+                     "on with the same weights [25]")
     sub.add_argument("--workers", type=natural, default=max(1, (os.cpu_count() or 1) - 1),
                      help="processes that play them while this one learns [cores - 1]")
     sub.add_argument("--minutes", type=float, default=0, help="stop after the round under way by "
@@ -2927,7 +2972,8 @@ def make_parser():
     add_config(sub, ExpertConfig, **TRAINING_DEFAULTS)
     add_config(sub, PlannerConfig, "MPPI while training", "plan-", **TRAINING_BUDGET)
     add_config(sub, DistillConfig, "The student (Algorithm 1), on the expert's batches and steps",
-               "distill-", skip=("steps", "batch_size", "new_targets", "held_out"))
+               "distill-", skip=("steps", "batch_size", "new_targets", "held_out"),
+               **FOLLOWING_DEFAULTS)
 
     sub = command("evaluate", command_evaluate, "Plan with a model (expert or student) through "
                   "whole episodes.")
@@ -2967,7 +3013,7 @@ def main(argv=None):
         elif args.command == "train":
             args.configs = (from_args(ExpertConfig, args, **TRAINING_DEFAULTS),
                             from_args(PlannerConfig, args, **TRAINING_BUDGET),
-                            from_args(DistillConfig, args))
+                            from_args(DistillConfig, args, **FOLLOWING_DEFAULTS))
         else:
             paper = paper_preset(PlannerConfig) if args.command == "benchmark" else {}
             args.configs = (from_args(PlannerConfig, args, **paper),)
