@@ -2254,11 +2254,11 @@ def _acting_worker(connection):
             seeds, std, models, tests = values
             environments += [Environment(task) for _ in seeds[len(environments):]]
             episodes = [Exploration(e, seed, std) for e, seed in zip(environments, seeds)]
-            planners = {name: _planner(*model) for name, model in models.items()}
+            planners = {name: Planner(*model) for name, model in models.items()}
             played, returns = 0, []
         elif command == "play":
-            model, decisions = values
-            planner = model and _planner(*model)
+            decisions, *planning = values
+            planner = Planner(*planning) if planning else None
             for episode in episodes:
                 episode.play(planner, decisions)
             played += decisions
@@ -2269,10 +2269,6 @@ def _acting_worker(connection):
             connection.send(([(np.stack(e.observation), np.stack(e.action),
                                np.array(e.reward, F32)) for e in episodes], returns))
         message = connection.recv()
-
-
-def _planner(model_config, params, config):
-    return Planner(WorldModel(model_config, params), config)
 
 
 class Actors:
@@ -2289,15 +2285,13 @@ class Actors:
         Beside them go whole episodes without noise: tests (name, seed), with the weights that
         models {name: (model, planner config)} have now.
         """
-        models = {name: (model.config, model.params, config)
-                  for name, (model, config) in models.items()}
         for i in range(self._count):
             self._workers.send(i, ("begin", seeds[i::self._count], std, models,
                                    tests[i::self._count]))
 
-    def play(self, decisions, model=None, config=None):
-        """Let the episodes go on by so many decisions, planned with a model or at random."""
-        self._workers.send_all(("play", model and (model.config, model.params, config), decisions))
+    def play(self, decisions, *planning):
+        """Let the episodes go on by so many decisions: (model, planner config), or at random."""
+        self._workers.send_all(("play", decisions, *planning))
 
     def wait(self):
         """Until they have."""
