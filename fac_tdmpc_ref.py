@@ -111,9 +111,9 @@ class PlannerConfig:
     pi_trajs: int = field(24, "policy proposals, where the model has a policy (Table 2)")
     horizon: int = field(1, "H: rewards that are summed before Q (H - 1 with value_at last) [D5]",
                          paper=3)
-    value_at: str = field("last", "where Q ends the return: after (Equation 2: H rewards, then Q "
-                          "of action H + 1) or last (authors' code: Q of action H) [D5]",
-                          paper="after", choices=("after", "last"))
+    value_at: str = field("after", "where Q ends the return: after (Equation 2: H rewards, then Q "
+                          "of action H + 1) or last (authors' code: Q of action H; with horizon "
+                          "1 plans are ranked by Q alone)", choices=("after", "last"))
     discount: float = field(0.99, "gamma (Table 2)")
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)")
     max_std: float = field(2.0, "first and largest sampling deviation (Table 2)")
@@ -2331,7 +2331,7 @@ class OnlineStudent:
 # for a few cores; hidden layers of 512, as in Table 2, make an update three times as dear
 TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}
 FOLLOWING_DEFAULTS = {"noise_samples": 3}
-TRAINING_BUDGET = {"samples": 128, "iterations": 4, "horizon": 3, "value_at": "after"}
+TRAINING_BUDGET = {"samples": 128, "iterations": 4, "horizon": 3}
 TRAINING_CURVE = ("decisions", "updates", "seconds", "std", "horizon", "return_mean", "return_min",
                   "return_max", "consistency", "reward", "value", "kl_reward", "kl_value",
                   "eval_expert", "eval_student")
@@ -2431,9 +2431,7 @@ class Training:
 
         It plans with the training budget and the default horizon.
         """
-        default = PlannerConfig()
-        testing = dataclasses.replace(self.planning, horizon=default.horizon,
-                                      value_at=default.value_at)
+        testing = dataclasses.replace(self.planning, horizon=PlannerConfig().horizon)
         models = {"expert": (self.learner.model, testing)}
         if self.student:
             models["student"] = self.student.model, testing
