@@ -111,9 +111,10 @@ class PlannerConfig:
     pi_trajs: int = field(24, "policy proposals, where the model has a policy (Table 2)")
     horizon: int = field(1, "H: rewards that are summed before Q (H - 1 with value_at last) [D5]",
                          paper=3)
-    value_at: str = field("after", "where Q ends the return: after (Equation 2: H rewards, then Q "
-                          "of action H + 1) or last (authors' code: Q of action H; with horizon "
-                          "1 plans are ranked by Q alone)", choices=("after", "last"))
+    value_at: str = field("auto", "where Q ends the return: after (Equation 2: H rewards, then Q "
+                          "of action H + 1), last (authors' code: Q of action H, alone if H is 1) "
+                          "or auto: after for experts, last for students [D5]",
+                          paper="after", choices=("auto", "after", "last"))
     discount: float = field(0.99, "gamma (Table 2)")
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)")
     max_std: float = field(2.0, "first and largest sampling deviation (Table 2)")
@@ -141,7 +142,13 @@ class PlannerConfig:
     @property
     def rewards(self):
         """Rewards in the return; the sequence has one action more, which only Q sees."""
-        return self.horizon if self.value_at == "after" else self.horizon - 1
+        return self.horizon - (self.value_at == "last")
+
+    def settled(self, model):
+        """This, with "auto" replaced by what suits the model: only experts have a policy."""
+        if self.value_at != "auto":
+            return self
+        return dataclasses.replace(self, value_at="after" if model.has_policy else "last")
 
 
 @dataclass(frozen=True)
@@ -1173,7 +1180,8 @@ class AgentPlanner:
     """Plans for the agents of one model: the same for all of them, for a share, for N = 1."""
 
     def __init__(self, model, config):
-        self.model, self.config, self.returns = model, config, Returns(model, config)
+        self.model, self.config = model, config.settled(model)
+        self.returns = Returns(model, self.config)
         self.reset([])
 
     def reset(self, seeds):
@@ -2146,18 +2154,19 @@ def command_distill(args):
     drawn = draw_curve(out / "curve.png", curve, f"{args.task}, seed {args.seed}")
 
     seeds = episode_seeds(args.eval_seed, args.episodes)
+    own, alike = planning.settled(expert), planning.settled(student)
     found = evaluate(student, args.task, planning, args.episodes, args.eval_seed, args.workers,
                      "evaluating the student")
-    returns = recorded_returns(header, planning, seeds)
+    returns = recorded_returns(header, own, seeds)
     recorded = returns is not None and not args.evaluate_expert
     if not recorded:
         returns = evaluate(expert, args.task, planning, args.episodes, args.eval_seed, args.workers,
                            "evaluating the expert")["returns"]
     obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
-    with Planner(expert, planning) as central, Planner(student, planning) as alone, \
-            Planner(student, planning, workers=beside) as parallel:
+    with Planner(expert, alike) as central, Planner(student, alike) as alone, \
+            Planner(student, alike, workers=beside) as parallel, Planner(expert, own) as at_best:
         timed, _ = take_turns([functools.partial(planner.act, obs) for planner in
-                               (central, alone, parallel)], 20, "timing")
+                               (central, alone, parallel, at_best)], 20, "timing")
         ms = (1e3 * np.median(timed, 0)).tolist()
     if not beside or (args.plan_workers is None and ms[2] >= ms[1]):
         beside, ms[2] = 0, ms[1]  # handing over costs more than it saves
@@ -2171,7 +2180,8 @@ def command_distill(args):
         "rank_correlation": float(rank[0]), "plan_ms_expert": ms[0],
         "plan_ms_student": ms[2], "speedup": ms[0] / ms[2], "expert_recorded": recorded,
         "out": str(out), "rank_correlation_by_step": [float(r) for r in rank],
-        "plan_ms_student_in_process": ms[1], "plan_workers": beside,
+        "plan_ms_student_in_process": ms[1], "plan_ms_expert_at_best": ms[3],
+        "plan_workers": beside,
         "student_returns": found["returns"], "expert_returns": returns,
         "seconds_total": round(time.time() - began, 1)}
     with atomic_file(out / "result.json", "w") as file:
@@ -2180,11 +2190,13 @@ def command_distill(args):
 
     print(f"\n{args.task}, {args.episodes} episodes, evaluation seed {args.eval_seed}, MPPI with "
           f"{planning.samples} samples, {planning.iterations} iterations, horizon "
-          f"{planning.horizon}, value_at {planning.value_at}\n")
+          f"{planning.horizon}; value_at {own.value_at} (expert), {alike.value_at} (student)\n")
     print_table([
         ("", "return", "ms a decision", "speed-up"),
         (f"expert ({'recorded' if recorded else 'measured now'}), one process",
-         f"{np.mean(returns):.0f} ± {np.std(returns):.0f}", f"{ms[0]:.1f}", "1.0"),
+         f"{np.mean(returns):.0f} ± {np.std(returns):.0f}", f"{ms[3]:.1f}",
+         f"{ms[0] / ms[3]:.1f}")] + [
+        ("expert, planning like its student", "", f"{ms[0]:.1f}", "1.0")] * (own != alike) + [
         (f"student, N = {num_agents}, one process",
          f"{result['student_return_mean']:.0f} ± {result['student_return_std']:.0f}",
          f"{ms[1]:.1f}", f"{ms[0] / ms[1]:.1f}")] + [
@@ -2331,7 +2343,7 @@ class OnlineStudent:
 # for a few cores; hidden layers of 512, as in Table 2, make an update three times as dear
 TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}
 FOLLOWING_DEFAULTS = {"noise_samples": 3}
-TRAINING_BUDGET = {"samples": 128, "iterations": 4, "horizon": 3}
+TRAINING_BUDGET = {"samples": 128, "iterations": 4, "horizon": 3, "value_at": "after"}
 TRAINING_CURVE = ("decisions", "updates", "seconds", "std", "horizon", "return_mean", "return_min",
                   "return_max", "consistency", "reward", "value", "kl_reward", "kl_value",
                   "eval_expert", "eval_student")
@@ -2431,7 +2443,9 @@ class Training:
 
         It plans with the training budget and the default horizon.
         """
-        testing = dataclasses.replace(self.planning, horizon=PlannerConfig().horizon)
+        default = PlannerConfig()
+        testing = dataclasses.replace(self.planning, horizon=default.horizon,
+                                      value_at=default.value_at)
         models = {"expert": (self.learner.model, testing)}
         if self.student:
             models["student"] = self.student.model, testing
@@ -2569,7 +2583,7 @@ def command_train(args):
             found = evaluate(model, args.task, PlannerConfig(), args.episodes, 0, None,
                              f"evaluating the {kind}")
             returns = found["returns"]
-            header["evaluation"] = evaluation_record(found, PlannerConfig(), 0)
+            header["evaluation"] = evaluation_record(found, PlannerConfig().settled(model), 0)
             result.update({prefix + "return_mean": float(np.mean(returns)), prefix + "returns":
                            returns, prefix + "return_std": float(np.std(returns))})
             rows.append((kind, f"{np.mean(returns):.0f} ± {np.std(returns):.0f}",
@@ -2623,7 +2637,7 @@ def command_evaluate(args):
               "returns": returns, "plan_ms_median": found["plan_ms_median"],
               "episodes": args.episodes, "task": task, "seed": args.seed}
     if args.record:
-        header["evaluation"] = evaluation_record(found, planning, args.seed)
+        header["evaluation"] = evaluation_record(found, planning.settled(model), args.seed)
         save_model(args.model, model, header)
     print_table([("task", "episodes", "return", "min", "max", "ms a decision"),
                  (task, str(args.episodes), f"{np.mean(returns):.0f} ± {np.std(returns):.0f}",

@@ -474,7 +474,7 @@ def write_golden(folder, replay, config):
     found.update(obs=obs, action=action, rewards=reward)
 
     # one refinement of MPPI (Equation 2) with fixed noise
-    planner = fac.PlannerConfig(samples=64, elites=8, pi_trajs=0, horizon=3)
+    planner = fac.PlannerConfig(samples=64, elites=8, pi_trajs=0, horizon=3, value_at="after")
     dim_action = expert.config.dim_action
     noise = rng.standard_normal((planner.rewards + 1, dim_action, planner.samples), np.float32)
     mean = rng.uniform(-0.5, 0.5, (planner.rewards + 1, dim_action)).astype(np.float32)

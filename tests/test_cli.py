@@ -175,7 +175,7 @@ def configs_of(monkeypatch, *arguments):
 def test_default_settings_are_those_of_the_dataclasses(monkeypatch):
     assert configs_of(monkeypatch, "distill") == (fac.DistillConfig(), fac.PlannerConfig())
     assert configs_of(monkeypatch, "evaluate", "--model", "x") == (fac.PlannerConfig(),)
-    assert configs_of(monkeypatch, "benchmark") == (fac.PlannerConfig(horizon=3),)
+    assert configs_of(monkeypatch, "benchmark") == (fac.PlannerConfig(horizon=3, value_at="after"),)
 
 
 def test_preset_paper_is_the_paper(monkeypatch):

@@ -93,6 +93,18 @@ def test_fast_returns_are_equation_2(n, value_at, horizon):
         assert np.abs(fast(actions) - plain).max() < 1e-5 * np.abs(plain).max()
 
 
+def test_auto_is_equation_2_for_an_expert_and_q_alone_for_a_student():
+    for model, expected in ((random_model(1, policy=True), "after"), (random_model(1), "last"),
+                            (random_model(3), "last")):
+        obs = np.ones(8)
+        plans = {value_at: fac.Planner(model, fac.PlannerConfig(samples=16, value_at=value_at)
+                                       ).act(obs) for value_at in ("auto", "after", "last")}
+        assert np.array_equal(plans["auto"], plans[expected])
+        assert not np.array_equal(plans["after"], plans["last"])
+        config = fac.PlannerConfig().settled(model)
+        assert config.value_at == expected and config.rewards == (expected == "after")
+
+
 def test_value_at_last_is_one_step_shorter():
     model, rng = random_model(), np.random.default_rng(2)
     z = model.encode(rng.standard_normal((8, 1), np.float32))
