@@ -142,6 +142,8 @@ class PlannerConfig:
     @property
     def rewards(self):
         """Rewards in the return; the sequence has one action more, which only Q sees."""
+        if self.value_at == "auto":
+            raise UserError("planner: value_at auto depends on the model; choose after or last")
         return self.horizon - (self.value_at == "last")
 
     def settled(self, model):
@@ -2801,6 +2803,8 @@ def command_benchmark(args):
             raise UserError(f"unknown robot {robot!r}; known: {', '.join(ROBOTS)}")
     if args.runs < 10:
         raise UserError(f"runs must be at least 10, not {args.runs}")
+    if planning.value_at == "auto":
+        raise UserError("value_at must be after or last here: both models plan alike")
     if args.figure:
         pyplot()  # before the work, not after it
     prediction, decision, hand_overs = [], [], []

@@ -290,6 +290,7 @@ def test_distill_refuses(tmp_path, files, flags, parts):
     (["evaluate"], ["--model"]),
     (["benchmark", "--robots", "reecher"], ["'reecher'", *fac.ROBOTS]),
     (["benchmark", "--runs", "9"], ["runs", "at least 10"]),
+    (["benchmark", "--value-at", "auto"], ["value_at", "after or last"]),
     (["benchmark", "--workers", "-1"], ["--workers", "-1"]),
     (["benchmark", "--elites", "600"], ["600 elites", "512 samples"]),
     (["evaluate", "--model", "none.npz"], ["none.npz", "no such file"]),

@@ -103,6 +103,8 @@ def test_auto_is_equation_2_for_an_expert_and_q_alone_for_a_student():
         assert not np.array_equal(plans["after"], plans["last"])
         config = fac.PlannerConfig().settled(model)
         assert config.value_at == expected and config.rewards == (expected == "after")
+    with pytest.raises(fac.UserError, match="depends on the model"):
+        fac.multiply_adds(model.config, fac.PlannerConfig())
 
 
 def test_value_at_last_is_one_step_shorter():
@@ -118,7 +120,7 @@ def test_value_at_last_is_one_step_shorter():
 def test_proposition_1(seed):
     """The best joint sequence is the best of each agent: all 5^(2 * 3) joint ones are tried."""
     model = random_model(n=3, seed=seed)
-    config, grid = fac.PlannerConfig(horizon=1), np.linspace(-1, 1, 5)
+    config, grid = fac.PlannerConfig(value_at="after"), np.linspace(-1, 1, 5)
     z = model.encode(np.random.default_rng(seed).standard_normal((8, 1)).astype(np.float32))
     own = np.array(list(product(grid, repeat=2)), np.float32).T  # (L, 25)
     individual = fac.h_step_return(model, z, np.broadcast_to(own[None, :, None], (3, 2, 1, 25)),
@@ -281,7 +283,7 @@ def test_multiply_adds_count_the_weights_of_equation_2():
     sizes = {name: sum(v.size for k, v in model.params.items() if k.startswith(name)
                        and k.endswith("weight") and v.shape[2] > 1)
              for name in ("_dynamics", "_reward", "_Q")}
-    config = fac.PlannerConfig(samples=7, iterations=2, horizon=3)
+    config = fac.PlannerConfig(samples=7, iterations=2, horizon=3, value_at="after")
     assert fac.multiply_adds(model.config, config) == 7 * 2 * (
         3 * (sizes["_dynamics"] + sizes["_reward"]) + sizes["_Q"])
 
@@ -298,7 +300,7 @@ def test_handing_over_leaves_the_plan_alone():
 def test_a_gain_of_zero_is_a_gain_all_the_same():
     model, rng = random_model(), np.random.default_rng(3)
     model.params["_Q1.1.weight"][:, :4] = 0
-    config = fac.PlannerConfig(horizon=2)
+    config = fac.PlannerConfig(horizon=2, value_at="after")
     z = model.encode(rng.standard_normal((8, 1), np.float32))
     actions = rng.uniform(-1, 1, (3, 3, 1, 9)).astype(np.float32)
     fast = fac.Returns(model, config)
