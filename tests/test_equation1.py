@@ -112,7 +112,11 @@ def test_golden_loss_and_gradients(source, dtype):
                 gradient.reshape(expected.shape)
             assert relative(gradient.reshape(expected.shape), expected) < bound, key
         else:
-            assert_digest(gradient, expected, bound)
+            # a last layer's bias sums errors that nearly cancel: float32 rounds by the layer's size
+            layer = [g[f"equation1_grad {key.rpartition('.')[0]}.{kind}"][0]
+                     for kind in ("weight", "bias")]
+            assert_digest(gradient, expected, bound,
+                          np.hypot(*layer) if dtype == np.float32 else None)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="needs PyTorch")
