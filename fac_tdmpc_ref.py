@@ -1910,8 +1910,8 @@ def _evaluation_worker(connection):
 def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="evaluating"):
     """Returns of `episodes` episodes, run side by side in `workers` processes (0: in this one).
 
-    Gives {"returns", "seeds", "plan_ms_median"}. An episode depends on its seed alone, so the
-    returns are the same for every number of workers.
+    Gives {"returns", "seeds", "seed", "planner", "plan_ms_median"}; planner: the settled settings.
+    An episode depends on its seed alone, so the returns are the same for every number of workers.
     """
     sizes, (_, _, *dims) = model.config, lookup_task(task)
     if dims != [sizes.dim_obs, sizes.dim_action]:
@@ -1930,7 +1930,8 @@ def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="eval
             if len(seconds) >= EPISODE_STEPS:
                 bar.set_postfix_str(f"mean return so far about "
                                     f"{returns.sum() * EPISODE_STEPS / len(seconds):.0f}", False)
-    return {"returns": [float(r) for r in returns], "seeds": seeds,
+    return {"returns": [float(r) for r in returns], "seeds": seeds, "seed": seed,
+            "planner": dataclasses.asdict(config.settled(model)),
             "plan_ms_median": 1e3 * float(np.median(seconds))}
 
 
@@ -2092,10 +2093,9 @@ def draw_curve(path, curve, title):
     return True
 
 
-def evaluation_record(found, config, seed):
+def evaluation_record(found):
     """What a model's header keeps of an `evaluate`; `recorded_returns` reads it."""
-    return {"returns": found["returns"], "seeds": found["seeds"], "seed": seed,
-            "planner": dataclasses.asdict(config)}
+    return {k: found[k] for k in ("returns", "seeds", "seed", "planner")}
 
 
 def recorded_returns(header, config, seeds):
@@ -2585,7 +2585,7 @@ def command_train(args):
             found = evaluate(model, args.task, PlannerConfig(), args.episodes, 0, None,
                              f"evaluating the {kind}")
             returns = found["returns"]
-            header["evaluation"] = evaluation_record(found, PlannerConfig().settled(model), 0)
+            header["evaluation"] = evaluation_record(found)
             result.update({prefix + "return_mean": float(np.mean(returns)), prefix + "returns":
                            returns, prefix + "return_std": float(np.std(returns))})
             rows.append((kind, f"{np.mean(returns):.0f} ± {np.std(returns):.0f}",
@@ -2639,7 +2639,7 @@ def command_evaluate(args):
               "returns": returns, "plan_ms_median": found["plan_ms_median"],
               "episodes": args.episodes, "task": task, "seed": args.seed}
     if args.record:
-        header["evaluation"] = evaluation_record(found, planning.settled(model), args.seed)
+        header["evaluation"] = evaluation_record(found)
         save_model(args.model, model, header)
     print_table([("task", "episodes", "return", "min", "max", "ms a decision"),
                  (task, str(args.episodes), f"{np.mean(returns):.0f} ± {np.std(returns):.0f}",
