@@ -243,14 +243,13 @@ def train(args, config, planner):
     out = Path(args.out)
     out.mkdir(parents=True, exist_ok=True)
     checkpoint = out / "checkpoint.pt"
-    settings = {"config": dataclasses.asdict(config), "planner": dataclasses.asdict(planner),
-                "task": args.task, "seed": args.seed, "envs": args.envs}
-    del settings["config"]["updates_per_step"]  # may change between two stretches of a run
+    # updates_per_step and the planner may change between two stretches of a run
+    settings = {"config": dataclasses.asdict(config), "task": args.task, "seed": args.seed,
+                "envs": args.envs}
+    del settings["config"]["updates_per_step"]
     if checkpoint.exists():
         saved = torch.load(checkpoint, weights_only=False, map_location=args.device)
-        if saved["settings"] != settings:
-            sys.exit(f"{checkpoint} was made with other settings: {saved['settings']}; "
-                     f"use its settings or another --out")
+        fac.same_settings({key: saved["settings"][key] for key in settings}, settings, checkpoint)
         learner.load(saved["learner"])
         decisions, seconds = saved["decisions"], saved["seconds"]
         elapsed = seconds
@@ -281,6 +280,7 @@ def train(args, config, planner):
             std = float(np.interp(decisions, [0, config.std_steps],
                                   [config.std_start, planner.min_std]))
             horizon = int(np.interp(decisions, [0, config.std_steps], [1, planner.horizon]))
+            horizon -= planner.value_at == "last"  # rewards before Q
             warming = decisions < config.seed_decisions
             mean = torch.zeros(horizon + 1, args.envs, dim_action, device=args.device)
             losses = []
@@ -584,7 +584,7 @@ def main(argv=None):
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--envs", type=int, default=8, help="environments stepped side by side [8]")
     parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 1) // 2),
-                        help="processes that step them; 0 for none")
+                        help="processes that step them, at least one")
     parser.add_argument("--threads", type=int, default=0, help="PyTorch threads; 0: its default")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--precision", choices=("float32", "bfloat16"), default="float32",
@@ -595,7 +595,7 @@ def main(argv=None):
     fac.add_config(parser, fac.ExpertConfig)
     few = fac.TRAINING_BUDGET
     fac.add_config(parser, fac.PlannerConfig, "MPPI while training", "plan-",
-                   skip=("value_at", "discount", "output"), **few)
+                   skip=("discount", "output"), **few)
     args = parser.parse_args(argv)
     args.out = args.out or f"runs/expert-{args.task}"
     try:

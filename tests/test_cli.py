@@ -636,3 +636,31 @@ def test_mujoco_and_dm_control_are_pinned_as_a_pair():
     names = re.findall(r'"([^"]+)"', dependencies)
     assert "mujoco==3.17.0" in names and "dm-control==1.0.50" in names
     assert not [name for name in names if "torch" in name or "matplotlib" in name]
+
+
+def test_train_expert_in_stretches(tmp_path, capsys):
+    """PyTorch's trainer goes on with another planner, but not with another learning rate."""
+    pytest.importorskip("torch")
+    import train_expert
+
+    def train(decisions, *more):
+        sizes = "--latent-dim 8 --mlp-dim 16 --enc-dim 16 --batch-size 8 --seed-decisions 500"
+        budget = "--updates-per-step 0.1 --plan-samples 8 --plan-iterations 1 --plan-pi-trajs 2"
+        return train_expert.main([*"--task walker-walk --envs 1 --workers 1 --threads 1".split(),
+                                  *sizes.split(), *budget.split(), "--decisions", str(decisions),
+                                  "--out", f"{tmp_path}/run", "--data", str(tmp_path), *more])
+
+    assert train(500) == 0
+    assert train(1000, "--plan-value-at", "last", "--plan-horizon", "1") == 0
+    curve = (tmp_path / "run" / "curve.csv").read_text().splitlines()
+    horizon = curve[0].split(",").index("horizon")
+    assert [row.split(",")[horizon] for row in curve[1:]] == ["1", "0"]
+    expert, header = fac.load_model(tmp_path / "walker-walk" / "expert.npz")
+    assert expert.has_policy and (header["decisions"], header["updates"]) == (1000, 100)
+    assert header["training_planner"]["value_at"] == "last"
+    assert fac.Replay(tmp_path / "walker-walk" / "replay.npz").transitions == 1000
+    assert (tmp_path / "walker-walk" / "golden.npz").exists()
+    assert train(1500, "--lr", "1e-3") == 2
+    message = capsys.readouterr().err.splitlines()[-1]
+    for part in ("checkpoint.pt", "lr: expected 0.001, found 0.0005", "--out"):
+        assert part in message
