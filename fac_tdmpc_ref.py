@@ -112,9 +112,10 @@ class PlannerConfig:
     horizon: int = field(1, "H: rewards that are summed before Q (H - 1 with value_at last) [D5]",
                          paper=3)
     value_at: str = field("auto", "where Q ends the return: after (Equation 2: H rewards, then Q "
-                          "of action H + 1), last (authors' code: Q of action H, alone if H is 1) "
-                          "or auto: after for experts, last for students [D5]",
-                          paper="after", choices=("auto", "after", "last"))
+                          "of action H + 1), last (authors' code: Q of action H, alone if H is 1), "
+                          "both (the mean of these two) or auto: after for experts, both for "
+                          "students [D5]",
+                          paper="after", choices=("auto", "after", "last", "both"))
     discount: float = field(0.99, "gamma (Table 2)")
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)")
     max_std: float = field(2.0, "first and largest sampling deviation (Table 2)")
@@ -143,14 +144,25 @@ class PlannerConfig:
     def rewards(self):
         """Rewards in the return; the sequence has one action more, which only Q sees."""
         if self.value_at == "auto":
-            raise UserError("planner: value_at auto depends on the model; choose after or last")
+            raise UserError("planner: value_at auto depends on the model; choose after, last or "
+                            "both")
         return self.horizon - (self.value_at == "last")
+
+    @property
+    def weights(self):
+        """What the return weighs each reward by, and each Q: {h: weight}."""
+        rewards = self.discount ** np.arange(self.rewards)
+        values = {self.rewards: self.discount ** self.rewards}
+        if self.value_at == "both":  # Q of action H is an estimate of all that follows, too
+            rewards[-1] /= 2
+            values = {h: self.discount ** h / 2 for h in (self.horizon - 1, self.horizon)}
+        return rewards.tolist(), values
 
     def settled(self, model):
         """This, with "auto" replaced by what suits the model: only experts have a policy."""
         if self.value_at != "auto":
             return self
-        return dataclasses.replace(self, value_at="after" if model.has_policy else "last")
+        return dataclasses.replace(self, value_at="after" if model.has_policy else "both")
 
 
 @dataclass(frozen=True)
@@ -1005,12 +1017,15 @@ def h_step_return(model, z, actions, config):
     minimum, a mean of sums is the sum of means, as Proposition 1 needs [D4].
     """
     z = np.repeat(z, actions.shape[-1], axis=2)
-    total = 0.0
-    for h in range(config.rewards):
-        total = total + config.discount ** h * model.reward(z, actions[:, h])
-        z = model.next(z, actions[:, h])
-    q1, q2 = model.q(z, actions[:, config.rewards])
-    return total + config.discount ** config.rewards * (q1 + q2) / 2
+    total, (rewards, values) = 0.0, config.weights
+    for h in range(len(rewards) + 1):
+        if h in values:
+            q1, q2 = model.q(z, actions[:, h])
+            total = total + values[h] * (q1 + q2) / 2
+        if h < len(rewards):
+            total = total + rewards[h] * model.reward(z, actions[:, h])
+            z = model.next(z, actions[:, h])
+    return total
 
 
 def homogeneous(params, layer):
@@ -1036,7 +1051,7 @@ class Returns:
     """
 
     def __init__(self, model, config):
-        self.config, self.sizes, p = config, model.config, model.params
+        self.weights, self.sizes, p = config.weights, model.config, model.params
         step, both_q = ("_dynamics", "_reward"), ("_Q1", "_Q2")
         self.first = [side_by_side(p, step, 0), self._fold_norm(p)]     # (N, 2h + 2, m + d + 1)
         self.second = [[homogeneous(p, f"{name}.{i}") for name in pair]  # (N, h + 1, h + 1)
@@ -1098,19 +1113,20 @@ class Returns:
         if width not in self._buffers:
             self._buffers[width] = self._make_buffers(width)
         x, y, y2, out = self._buffers[width]                            # x is (z, a, 1)
-        for h in range(self.config.rewards):
+        rewards, values = self.weights
+        for h in range(len(rewards) + 1):
             x[:, m:-1] = actions[:, h]
-            self._hidden(0, h, x, y, y2)
-            np.matmul(self.to_reward, y2[:, half:], out=out)
-            out *= self.config.discount ** h
-            total += out[:, 0]
-            np.matmul(self.to_latent, y2[:, :half], out=x[:, :m])
-        h = self.config.rewards
-        x[:, m:-1] = actions[:, h]
-        self._hidden(1, h, x, y, y2)
-        np.matmul(self.to_q, y2, out=out)
-        out *= self.config.discount ** h
-        total += out[:, 0]
+            if h in values:
+                self._hidden(1, h, x, y, y2)
+                np.matmul(self.to_q, y2, out=out)
+                out *= values[h]
+                total += out[:, 0]
+            if h < len(rewards):
+                self._hidden(0, h, x, y, y2)
+                np.matmul(self.to_reward, y2[:, half:], out=out)
+                out *= rewards[h]
+                total += out[:, 0]
+                np.matmul(self.to_latent, y2[:, :half], out=x[:, :m])
 
     def _hidden(self, pair, h, x, y, y2):
         """Both hidden layers of a pair of networks (0: dynamics and reward, 1: the two Q)."""
@@ -2703,7 +2719,8 @@ def multiply_adds(config, planner):
     cost = {name: agents * sum(a * b for a, b in zip(widths, widths[1:]))
             for name, _, agents, widths in networks(config)}
     step, value = cost["_dynamics"] + cost["_reward"], cost["_Q1"] + cost["_Q2"]
-    return planner.samples * planner.iterations * (planner.rewards * step + value)
+    rewards, values = planner.weights
+    return planner.samples * planner.iterations * (len(rewards) * step + len(values) * value)
 
 
 def benchmark_prediction(robot, workers, runs):
@@ -2804,7 +2821,7 @@ def command_benchmark(args):
     if args.runs < 10:
         raise UserError(f"runs must be at least 10, not {args.runs}")
     if planning.value_at == "auto":
-        raise UserError("value_at must be after or last here: both models plan alike")
+        raise UserError("value_at must be after, last or both here: both models plan alike")
     if args.figure:
         pyplot()  # before the work, not after it
     prediction, decision, hand_overs = [], [], []

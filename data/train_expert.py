@@ -184,43 +184,45 @@ class Learner:
         return consistency, reward_loss, value_loss
 
     @torch.inference_mode()
-    def plan(self, obs, mean, horizon, planner, min_std):
+    def plan(self, obs, mean, planner, min_std):
         """MPPI (Equation 2) for E environments at once; exploration noise of min_std.
 
-        obs (E, O); mean (horizon+1, E, A) is the warm start. Returns actions (E, A) and the
-        new mean.
+        obs (E, O); mean (L, E, A) is the warm start. Returns actions (E, A) and the new mean.
         """
+        length, (rewards, values) = len(mean), planner.weights
         z0 = self.model.encode(obs)
         num_env, samples = len(obs), planner.samples
         pi_trajs, dim_action = planner.pi_trajs, mean.shape[-1]
         z, proposals = z0.repeat_interleave(pi_trajs, 0), []
-        for h in range(horizon + 1):
+        for h in range(length):
             proposals.append(self.model.pi(z, min_std))
-            if h < horizon:
+            if h < length - 1:
                 z = self.model.next(z, proposals[-1])[0]
-        proposals = torch.stack(proposals).view(horizon + 1, num_env, pi_trajs, dim_action)
+        proposals = torch.stack(proposals).view(length, num_env, pi_trajs, dim_action)
         std = torch.full_like(mean, planner.max_std)
         start = z0.repeat_interleave(samples + pi_trajs, 0)
         for _ in range(planner.iterations):
-            noise = torch.randn(horizon + 1, num_env, samples, dim_action, device=obs.device)
+            noise = torch.randn(length, num_env, samples, dim_action, device=obs.device)
             actions = (mean[:, :, None] + std[:, :, None] * noise).clamp(-1, 1)
             actions = torch.cat([actions, proposals], 2)
             flat, z, value = actions.flatten(1, 2), start, 0.0
-            for h in range(horizon):
-                z, r = self.model.next(z, flat[h])
-                value = value + self.config.discount ** h * r
-            q = torch.stack(self.model.q(z, flat[horizon])).mean(0)
-            value = (value + self.config.discount ** horizon * q).view(num_env, -1).nan_to_num()
+            for h in range(length):
+                if h in values:
+                    value = value + values[h] * sum(self.model.q(z, flat[h])) / 2
+                if h < len(rewards):
+                    z, r = self.model.next(z, flat[h])
+                    value = value + rewards[h] * r
+            value = value.view(num_env, -1).nan_to_num()
             top, index = value.topk(planner.elites, 1)
             elites = actions.gather(2, index[None, :, :, None].expand(
-                horizon + 1, -1, -1, dim_action))
+                length, -1, -1, dim_action))
             score = torch.softmax(planner.temperature * top, 1)[None, :, :, None]
             new_mean = (score * elites).sum(2)
             std = ((score * (elites - new_mean[:, :, None]) ** 2).sum(2)).sqrt()
             std = std.clamp(min_std, planner.max_std)
             mean = planner.momentum * mean + (1 - planner.momentum) * new_mean
         chosen = torch.multinomial(score[0, :, :, 0], 1)[None, :, :, None]
-        action = elites.gather(2, chosen.expand(horizon + 1, -1, -1, dim_action))[0, :, 0]
+        action = elites.gather(2, chosen.expand(length, -1, -1, dim_action))[0, :, 0]
         action = (action + min_std * torch.randn_like(action)).clamp(-1, 1)
         return action, mean
 
@@ -280,16 +282,16 @@ def train(args, config, planner):
             std = float(np.interp(decisions, [0, config.std_steps],
                                   [config.std_start, planner.min_std]))
             horizon = int(np.interp(decisions, [0, config.std_steps], [1, planner.horizon]))
-            horizon -= planner.value_at == "last"  # rewards before Q
+            planning = dataclasses.replace(planner, horizon=horizon, discount=config.discount)
             warming = decisions < config.seed_decisions
-            mean = torch.zeros(horizon + 1, args.envs, dim_action, device=args.device)
+            mean = torch.zeros(planning.rewards + 1, args.envs, dim_action, device=args.device)
             losses = []
             for step in range(fac.EPISODE_STEPS):
                 if warming:
                     action = rng.uniform(-1, 1, (args.envs, dim_action)).astype(np.float32)
                 else:
                     with learner.autocast():
-                        action, mean = learner.plan(to_device(obs), mean, horizon, planner, std)
+                        action, mean = learner.plan(to_device(obs), mean, planning, std)
                     mean = torch.cat([mean[1:], torch.zeros_like(mean[:1])])
                     action = action.cpu().numpy()
                 obs, reward = pool.step(action)

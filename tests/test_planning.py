@@ -76,7 +76,7 @@ def test_proposals_compete():
     assert np.allclose(mean, target)
 
 
-@pytest.mark.parametrize("value_at", ["after", "last"])
+@pytest.mark.parametrize("value_at", ["after", "last", "both"])
 @pytest.mark.parametrize("horizon", [3, 1])
 @pytest.mark.parametrize("n", [1, 3])
 def test_fast_returns_are_equation_2(n, value_at, horizon):
@@ -93,27 +93,33 @@ def test_fast_returns_are_equation_2(n, value_at, horizon):
         assert np.abs(fast(actions) - plain).max() < 1e-5 * np.abs(plain).max()
 
 
-def test_auto_is_equation_2_for_an_expert_and_q_alone_for_a_student():
-    for model, expected in ((random_model(1, policy=True), "after"), (random_model(1), "last"),
-                            (random_model(3), "last")):
+def test_auto_is_equation_2_for_an_expert_and_both_for_a_student():
+    for model, expected in ((random_model(1, policy=True), "after"), (random_model(1), "both"),
+                            (random_model(3), "both")):
         obs = np.ones(8)
         plans = {value_at: fac.Planner(model, fac.PlannerConfig(samples=16, value_at=value_at)
-                                       ).act(obs) for value_at in ("auto", "after", "last")}
-        assert np.array_equal(plans["auto"], plans[expected])
-        assert not np.array_equal(plans["after"], plans["last"])
-        config = fac.PlannerConfig().settled(model)
-        assert config.value_at == expected and config.rewards == (expected == "after")
+                                       ).act(obs) for value_at in ("auto", "after", "last", "both")}
+        assert np.array_equal(plans.pop("auto"), plans[expected])
+        assert len({plan.tobytes() for plan in plans.values()}) == 3
+        assert fac.PlannerConfig().settled(model).value_at == expected
     with pytest.raises(fac.UserError, match="depends on the model"):
         fac.multiply_adds(model.config, fac.PlannerConfig())
 
 
-def test_value_at_last_is_one_step_shorter():
+def test_value_at():
+    """`last` is one step shorter than `after`, `both` the mean of the two."""
     model, rng = random_model(), np.random.default_rng(2)
     z = model.encode(rng.standard_normal((8, 1), np.float32))
-    actions = rng.uniform(-1, 1, (3, 3, 1, 7)).astype(np.float32)
-    after = fac.h_step_return(model, z, actions, fac.PlannerConfig(horizon=2, value_at="after"))
-    last = fac.h_step_return(model, z, actions, fac.PlannerConfig(horizon=3, value_at="last"))
-    assert np.array_equal(after, last)
+    actions = rng.uniform(-1, 1, (3, 4, 1, 7)).astype(np.float32)
+
+    def returns(horizon, value_at):
+        config = fac.PlannerConfig(horizon=horizon, value_at=value_at)
+        return fac.h_step_return(model, z, actions, config)
+
+    assert np.array_equal(returns(2, "after"), returns(3, "last"))
+    for horizon in (1, 3):
+        mean = (returns(horizon, "after") + returns(horizon, "last")) / 2
+        assert np.allclose(returns(horizon, "both"), mean, rtol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(3))
