@@ -198,11 +198,16 @@ class DistillConfig:
                        choices=("table2", "section51"))
     new_targets: float = field(0.5, "reacher only: share of states whose target is drawn anew, as "
                                "the task draws it [D7]", paper=0.0)
+    own_episodes: int = field(16, "episodes that the student plays after each quarter of the "
+                              "steps; their states join the replay's [D9]", paper=0)
+    own_share: float = field(0.25, "share of states from the student's own episodes [D9]",
+                             paper=0.0)
     held_out: float = field(0.05, "share of episodes kept for the rank correlation")
 
     def __post_init__(self):
         for name, least in (("steps", 1), ("batch_size", 1), ("horizon", 1), ("noise_samples", 2),
-                            ("lam", 0), ("reward_coef", 0), ("value_coef", 0), ("warmup", 0)):
+                            ("lam", 0), ("reward_coef", 0), ("value_coef", 0), ("warmup", 0),
+                            ("own_episodes", 0)):
             if not getattr(self, name) >= least:
                 raise UserError(f"distillation: {name} must be at least {least}, not "
                                 f"{getattr(self, name)}")
@@ -213,8 +218,9 @@ class DistillConfig:
         if not self.noise_std >= self.noise_std_min:
             raise UserError(f"distillation: noise_std must be at least noise_std_min "
                             f"({self.noise_std_min}), not {self.noise_std}")
-        if not 0 <= self.new_targets <= 1:
-            raise UserError(f"distillation: new_targets is a share, not {self.new_targets}")
+        for name in ("new_targets", "own_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise UserError(f"distillation: {name} is a share, not {getattr(self, name)}")
         if not 0 < self.held_out <= 0.5:
             raise UserError(f"distillation: held_out must lie between 0 and 0.5, not "
                             f"{self.held_out}")
@@ -926,7 +932,7 @@ class Distiller:
         agents = sizes.dim_action if num_agents is None else num_agents
         self._threads = one_thread()  # until `close`, in this thread and the teacher's
         self.optimizer, self.student = new_student(expert, agents, config, seed)
-        self.replay = replay
+        self.replay, self._own = replay, {}
         self._teacher, self._next = ThreadPoolExecutor(1), None
         self._arenas = Arena(), Arena()  # the student's and the teacher's
 
@@ -935,6 +941,13 @@ class Distiller:
         rng = np.random.default_rng([self.seed, t])
         starts = rng.choice(self.train_starts, self.config.batch_size)
         obs, actions = self.replay.sequences(starts, self.steps)
+        if self._own:  # [D9]
+            count = int(self.config.own_share * len(starts))
+            episode, start = (rng.integers(n, size=count) for n in
+                              (self.played, EPISODE_STEPS - self.steps + 1))
+            rows = start + np.arange(self.steps)[:, None]
+            obs[:, :count] = self._own["own_observation"][episode, start].T
+            actions[..., :count] = self._own["own_action"][episode, rows].swapaxes(1, 2)
         task = self.replay.header.get("task", "")
         if task.startswith("reacher"):  # [D7]
             chosen = rng.random(len(starts)) < self.config.new_targets
@@ -958,9 +971,28 @@ class Distiller:
         """Steps made so far."""
         return self.optimizer.adam.t
 
+    @property
+    def played(self):
+        """Episodes of the student's own that `batch` draws from."""
+        return len(self._own.get("own_action", ()))
+
+    def add(self, episodes):
+        """Let episodes of the student's, (T + 1, O) and (T, A) each, join the data [D9]."""
+        if self._next:
+            self._next.result()  # drawn without them
+        new = [np.stack(x).astype(np.float16) for x in zip(*episodes)]
+        for name, x in zip(("own_observation", "own_action"), new):
+            self._own[name] = np.concatenate([self._own.get(name, x[:0]), x])
+        self._next = None
+
+    def state(self):
+        """Everything that a resumed run needs."""
+        return {**self.optimizer.state(), **self._own}
+
     def load(self, state):
-        """Go on from the `state` of an optimizer."""
+        """Go on from a `state`."""
         self.optimizer.load(state)
+        self._own = {k: state[k] for k in ("own_observation", "own_action") if k in state}
         self._next = None
 
     def close(self):
@@ -1923,16 +1955,21 @@ def _evaluation_worker(connection):
                 part = []
 
 
+def check_task(sizes, task):
+    """UserError if a model of these sizes isn't for the task."""
+    _, _, *dims = lookup_task(task)
+    if dims != [sizes.dim_obs, sizes.dim_action]:
+        raise UserError(f"the model has (dim O, dim A) = ({sizes.dim_obs}, {sizes.dim_action}), "
+                        f"{task} has ({dims[0]}, {dims[1]}); name the task it was made for")
+
+
 def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="evaluating"):
     """Returns of `episodes` episodes, run side by side in `workers` processes (0: in this one).
 
     Gives {"returns", "seeds", "seed", "planner", "plan_ms_median"}; planner: the settled settings.
     An episode depends on its seed alone, so the returns are the same for every number of workers.
     """
-    sizes, (_, _, *dims) = model.config, lookup_task(task)
-    if dims != [sizes.dim_obs, sizes.dim_action]:
-        raise UserError(f"the model has (dim O, dim A) = ({sizes.dim_obs}, {sizes.dim_action}), "
-                        f"{task} has ({dims[0]}, {dims[1]}); name the task it was made for")
+    check_task(model.config, task)
     if episodes < 1:
         raise UserError(f"episodes must be at least 1, not {episodes}")
     seeds = episode_seeds(seed, episodes)
@@ -2009,11 +2046,11 @@ CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correla
          "rank_correlation_last")
 
 
-def train_student(distiller, out, settings):
+def train_student(distiller, out, settings, workers):
     """Algorithm 1 to its end, with a learning curve and checkpoints in `out`.
 
     A run that was cut off goes on from its checkpoint and ends as if it had not been. Returns
-    (curve rows, seconds).
+    (curve rows, seconds). workers: processes that play the student's own episodes [D9].
     """
     checkpoint, config = out / "checkpoint.npz", distiller.config
     curve, before = [], 0.0
@@ -2027,6 +2064,9 @@ def train_student(distiller, out, settings):
     losses = []
     with progress("distilling", config.steps, "step", distiller.t) as bar:
         while distiller.t < config.steps:
+            if distiller.played < distiller.t * 4 // config.steps * config.own_episodes:
+                bar.set_postfix_str(f"the student plays {config.own_episodes} episodes")
+                distiller.add(own_episodes(distiller, settings["task"], workers))
             rate = learning_rate(config, distiller.t)
             losses.append(distiller.step())
             bar.update()
@@ -2041,10 +2081,25 @@ def train_student(distiller, out, settings):
                 write_curve(out / "curve.csv", CURVE, curve)
                 if time.time() - saved > 30 or distiller.t == config.steps:
                     write_npz(checkpoint, {"kind": "checkpoint", "settings": settings,
-                                           "curve": curve, "seconds": seconds},
-                              distiller.optimizer.state())
+                                           "curve": curve, "seconds": seconds}, distiller.state())
                     saved = time.time()
     return curve, before + time.time() - began
+
+
+OWN_BUDGET = {"samples": 128, "iterations": 4}
+
+
+def own_episodes(distiller, task, workers):
+    """The next episodes of the student's own, (T + 1, O) and (T, A) each [D9]."""
+    count, first = distiller.config.own_episodes, distiller.played
+    seeds = [int(np.random.default_rng([distiller.seed, 3, first + i]).integers(2 ** 31))
+             for i in range(count)]
+    workers = os.cpu_count() or 1 if workers is None else workers
+    with contextlib.closing(Actors(task, max(1, min(workers, count)))) as actors:
+        actors.begin(seeds, 0.0, {}, [])
+        actors.play(EPISODE_STEPS, distiller.student, PlannerConfig(**OWN_BUDGET))
+        actors.wait()
+        return [episode[:2] for episode in actors.collect()[0]]
 
 
 def same_settings(found, expected, where):
@@ -2148,6 +2203,7 @@ def command_distill(args):
         if header.get(key) != expected:
             raise UserError(f"{expert_path}: header: {key}: expected {expected!r}, found "
                             f"{header.get(key)!r}")
+    check_task(expert.config, args.task)
     replay = Replay(args.replay or data_file(args.task, "replay.npz"))
     out = output_folder(args.out or f"runs/{args.task}-{args.seed}")
     distiller = Distiller(expert, replay, config, args.num_agents, args.seed)
@@ -2163,7 +2219,7 @@ def command_distill(args):
           f"{replay.transitions:,} transitions; {config.steps:,} steps of {config.batch_size} x "
           f"{config.noise_samples}; results in {out}", file=sys.stderr)
     with contextlib.closing(distiller):
-        curve, seconds = train_student(distiller, out, settings)
+        curve, seconds = train_student(distiller, out, settings, args.workers)
         rank = rank_correlation(distiller, 256, args.seed)
     student = distiller.student
     save_model(out / "student.npz", student, {"kind": "student", **settings})
@@ -2999,7 +3055,8 @@ def make_parser():
     add_config(sub, ExpertConfig, **TRAINING_DEFAULTS)
     add_config(sub, PlannerConfig, "MPPI while training", "plan-", **TRAINING_BUDGET)
     add_config(sub, DistillConfig, "The student (Algorithm 1), on the expert's batches and steps",
-               "distill-", skip=("steps", "batch_size", "new_targets", "held_out"),
+               "distill-", skip=("steps", "batch_size", "new_targets", "own_episodes", "own_share",
+                                "held_out"),
                **FOLLOWING_DEFAULTS)
 
     sub = command("evaluate", command_evaluate, "Plan with a model (expert or student) through "

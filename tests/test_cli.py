@@ -23,7 +23,8 @@ SCRIPT = ROOT / "fac_tdmpc_ref.py"
 STEPS = 6
 BUDGET = ["--samples", "16", "--iterations", "1"]
 TINY = ["--steps", str(STEPS), "--batch-size", "4", "--horizon", "1", "--held-out", "0.34",
-        "--warmup", "2", "--episodes", "1", "--plan-samples", "16", "--plan-iterations", "1"]
+        "--warmup", "2", "--own-episodes", "0", "--episodes", "1", "--plan-samples", "16",
+        "--plan-iterations", "1"]
 # BLAS threads that wait for a busy core make runs many times longer
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 KEYS = {"task", "seed", "steps", "seconds", "expert_return_mean", "expert_return_std",
@@ -529,6 +530,24 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(killed, distilled):
     assert rows_without_seconds(out / "curve.csv") == rows_without_seconds(
         distilled[1] / "curve.csv")
     assert not (out / "checkpoint.npz").exists() and (out / "result.json").exists()
+
+
+def test_a_killed_run_whose_student_plays_goes_on(tmp_path, files, no_plots):
+    """The student's own episodes depend on its weights alone, whoever plays them [D9]."""
+    def distill(out, *more, stop=-1):
+        arguments = distill_arguments(files, "--own-episodes", "2", "--out", tmp_path / out, *more)
+        return launch(["-c", DRIVER, stop, *arguments], tmp_path, no_plots)
+
+    succeeded(distill("whole", "--workers", "1"))
+    for stop in (3, 5):  # the student plays before steps 2, 3 and 5, counted from 0
+        assert distill("parts", "--workers", "2", stop=stop).returncode == -signal.SIGKILL
+    with np.load(tmp_path / "parts" / "checkpoint.npz") as file:
+        assert file["own_action"].shape == (4, fac.EPISODE_STEPS, 3)
+    succeeded(distill("parts"))
+    assert student_of(tmp_path / "parts") == student_of(tmp_path / "whole")
+    without = distill_arguments(files, "--out", tmp_path / "without")
+    succeeded(launch(["-c", DRIVER, -1, *without], tmp_path, no_plots))
+    assert student_of(tmp_path / "without")[0] != student_of(tmp_path / "whole")[0]
 
 
 @pytest.mark.parametrize("flags, parts", [

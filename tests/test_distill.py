@@ -64,16 +64,51 @@ def test_same_seed_same_student(replay):
     assert not np.array_equal(students[0], students[2])
 
 
-def test_a_resumed_run_ends_as_an_uninterrupted_one(replay):
-    whole, _ = distilled(replay, CONFIG, 20)
-    first, _ = distilled(replay, CONFIG, 12)
+def own_episode(observation):
+    """An episode of one observation and one action."""
+    shape = fac.EPISODE_STEPS + 1, 8
+    return np.full(shape, observation, np.float32), np.full((shape[0] - 1, 3), 0.25, np.float32)
+
+
+def go_on(distiller, steps):
+    distiller._teacher = fac.ThreadPoolExecutor(1)
+    for _ in range(steps):
+        distiller.step()
+    distiller.close()
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_a_resumed_run_ends_as_an_uninterrupted_one(replay, own):
+    whole, _ = distilled(replay, CONFIG, 5)
+    if own:
+        whole.add([own_episode(0.5), own_episode(-0.5)])
+    go_on(whole, 7)
     second, _ = distilled(replay, CONFIG, 3)  # somewhere else, then put back
-    second._teacher = fac.ThreadPoolExecutor(1)
-    second.load({k: np.copy(v) for k, v in first.optimizer.state().items()})
-    for _ in range(8):
-        second.step()
-    second.close()
+    second.load({k: np.copy(v) for k, v in whole.state().items()})
+    go_on(whole, 8)
+    go_on(second, 8)
     assert np.array_equal(whole.optimizer.vector, second.optimizer.vector)
+    without, _ = distilled(replay, CONFIG, 20)
+    assert np.array_equal(whole.optimizer.vector, without.optimizer.vector) != own
+
+
+def test_a_share_of_each_batch_is_the_students_own(replay):
+    config = fac.dataclasses.replace(CONFIG, encoder_input="observation", own_share=0.25,
+                                     noise_std=1e-3, noise_std_min=1e-3)
+    distiller, _ = distilled(replay, config, 0)
+    before = distiller.batch(7)
+    distiller.add([own_episode(7), own_episode(8)])
+    distiller.add([own_episode(9)])
+    assert distiller.played == 3
+    seen = set()
+    for t in range(20):
+        (features,), actions, _ = distiller.batch(t)
+        own = features.min(0) >= 7
+        assert own.sum() == 4 and np.abs(actions[:, :, own] - 0.25).max() < 0.01
+        seen |= set(features[0, own])
+    assert seen == {7, 8, 9}
+    (features,), actions, _ = distiller.batch(7)
+    assert np.array_equal(features[:, 4:], before[0][0][:, 4:]), "the others are as they were"
 
 
 @pytest.mark.parametrize("n", [1, 3])
