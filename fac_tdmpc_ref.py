@@ -150,8 +150,8 @@ class PlannerConfig:
 
     @property
     def weights(self):
-        """What the return weighs each reward by, and each Q: {h: weight}."""
-        rewards = self.discount ** np.arange(self.rewards)
+        """What the return is summed with: the rewards' weights, and {h: weight of Q}."""
+        rewards = float(self.discount) ** np.arange(self.rewards)
         values = {self.rewards: self.discount ** self.rewards}
         if self.value_at == "both":  # Q of action H is an estimate of all that follows, too
             rewards[-1] /= 2
@@ -915,7 +915,7 @@ def learning_rate(config, t):
 
 
 class Distiller:
-    """Algorithm 1: one `step` after the other, reproducible from (seed, step) alone.
+    """Algorithm 1: one `step` after the other, reproducible from the seed, and from `state`.
 
     The expert's side of the next step runs on a second thread while the student learns from
     this one: NumPy lets go of the interpreter inside its products, so both cores are busy.
@@ -941,7 +941,7 @@ class Distiller:
         rng = np.random.default_rng([self.seed, t])
         starts = rng.choice(self.train_starts, self.config.batch_size)
         obs, actions = self.replay.sequences(starts, self.steps)
-        if self._own:  # [D9]
+        if self._own:  # the first ones are the student's own [D9]
             count = int(self.config.own_share * len(starts))
             episode, start = (rng.integers(n, size=count) for n in
                               (self.played, EPISODE_STEPS - self.steps + 1))
@@ -1043,10 +1043,10 @@ def rank_correlation(distiller, states, seed):
 
 
 def h_step_return(model, z, actions, config):
-    """Equation 2 for every agent, as it reads; `Returns` computes the same faster.
+    """Equation 2 for every agent, or its kin [D5], as it reads; `Returns` computes it faster.
 
-    z (N, m, 1), actions (N, L, d, S) -> G (N, S). Q is the mean of the two: unlike TD-MPC's
-    minimum, a mean of sums is the sum of means, as Proposition 1 needs [D4].
+    z (N, m, 1), actions (N, L, d, S) -> G (N, S), summed with `config.weights`. Q is the mean of the
+    two: unlike TD-MPC's minimum, a mean of sums is the sum of means, as Proposition 1 needs [D4].
     """
     z = np.repeat(z, actions.shape[-1], axis=2)
     total, (rewards, values) = 0.0, config.weights
@@ -2086,9 +2086,6 @@ def train_student(distiller, out, settings, workers):
     return curve, before + time.time() - began
 
 
-OWN_BUDGET = {"samples": 128, "iterations": 4}
-
-
 def own_episodes(distiller, task, workers):
     """The next episodes of the student's own, (T + 1, O) and (T, A) each [D9]."""
     count, first = distiller.config.own_episodes, distiller.played
@@ -2097,7 +2094,7 @@ def own_episodes(distiller, task, workers):
     workers = os.cpu_count() or 1 if workers is None else workers
     with contextlib.closing(Actors(task, max(1, min(workers, count)))) as actors:
         actors.begin(seeds, 0.0, {}, [])
-        actors.play(EPISODE_STEPS, distiller.student, PlannerConfig(**OWN_BUDGET))
+        actors.play(EPISODE_STEPS, distiller.student, PlannerConfig(samples=128, iterations=4))
         actors.wait()
         return [episode[:2] for episode in actors.collect()[0]]
 
