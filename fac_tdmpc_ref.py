@@ -1045,8 +1045,9 @@ def rank_correlation(distiller, states, seed):
 def h_step_return(model, z, actions, config):
     """Equation 2 for every agent, or its kin [D5], as it reads; `Returns` computes it faster.
 
-    z (N, m, 1), actions (N, L, d, S) -> G (N, S), summed with `config.weights`. Q is the mean of the
-    two: unlike TD-MPC's minimum, a mean of sums is the sum of means, as Proposition 1 needs [D4].
+    z (N, m, 1), actions (N, L, d, S) -> G (N, S), summed with `config.weights`. Q is the mean of
+    the two: unlike TD-MPC's minimum, a mean of sums is the sum of means, as Proposition 1 needs
+    [D4].
     """
     z = np.repeat(z, actions.shape[-1], axis=2)
     total, (rewards, values) = 0.0, config.weights
