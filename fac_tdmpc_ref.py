@@ -932,7 +932,8 @@ class Distiller:
         agents = sizes.dim_action if num_agents is None else num_agents
         self._threads = one_thread()  # until `close`, in this thread and the teacher's
         self.optimizer, self.student = new_student(expert, agents, config, seed)
-        self.replay, self._own = replay, {}
+        self.replay, self.own = replay, ReplayBuffer(  # [D9]
+            sizes.dim_obs, sizes.dim_action, 3 * config.own_episodes * EPISODE_STEPS, np.float16)
         self._teacher, self._next = ThreadPoolExecutor(1), None
         self._arenas = Arena(), Arena()  # the student's and the teacher's
 
@@ -941,13 +942,10 @@ class Distiller:
         rng = np.random.default_rng([self.seed, t])
         starts = rng.choice(self.train_starts, self.config.batch_size)
         obs, actions = self.replay.sequences(starts, self.steps)
-        if self._own:  # the first ones are the student's own [D9]
+        if len(self.own):  # the first ones are the student's own [D9]
             count = int(self.config.own_share * len(starts))
-            episode, start = (rng.integers(n, size=count) for n in
-                              (self.played, EPISODE_STEPS - self.steps + 1))
-            rows = start + np.arange(self.steps)[:, None]
-            obs[:, :count] = self._own["own_observation"][episode, start].T
-            actions[..., :count] = self._own["own_action"][episode, rows].swapaxes(1, 2)
+            own, actions[..., :count], _ = self.own.sample(rng, count, self.steps, "")
+            obs[:, :count] = own[0]
         task = self.replay.header.get("task", "")
         if task.startswith("reacher"):  # [D7]
             chosen = rng.random(len(starts)) < self.config.new_targets
@@ -971,28 +969,22 @@ class Distiller:
         """Steps made so far."""
         return self.optimizer.adam.t
 
-    @property
-    def played(self):
-        """Episodes of the student's own that `batch` draws from."""
-        return len(self._own.get("own_action", ()))
-
     def add(self, episodes):
-        """Let episodes of the student's, (T + 1, O) and (T, A) each, join the data [D9]."""
+        """Let episodes that the student played, as `ReplayBuffer.add` takes them, join the data."""
         if self._next:
             self._next.result()  # drawn without them
-        new = [np.stack(x).astype(np.float16) for x in zip(*episodes)]
-        for name, x in zip(("own_observation", "own_action"), new):
-            self._own[name] = np.concatenate([self._own.get(name, x[:0]), x])
+        for episode in episodes:
+            self.own.add(*episode)
         self._next = None
 
     def state(self):
         """Everything that a resumed run needs."""
-        return {**self.optimizer.state(), **self._own}
+        return {**self.optimizer.state(), **{f"own_{k}": v for k, v in self.own.state().items()}}
 
     def load(self, state):
         """Go on from a `state`."""
         self.optimizer.load(state)
-        self._own = {k: state[k] for k in ("own_observation", "own_action") if k in state}
+        self.own.load({k[4:]: v for k, v in state.items() if k.startswith("own_")})
         self._next = None
 
     def close(self):
@@ -1876,6 +1868,18 @@ class ReplayBuffer:
         self.observation[i], self.action[i], self.reward[i] = observation, action, reward
         self.count += 1
 
+    def state(self):
+        """The episodes held, as arrays; `load` takes them back."""
+        kept = len(self)
+        return {"observation": self.observation[:kept], "action": self.action[:kept],
+                "reward": self.reward[:kept], "count": np.int64(self.count)}
+
+    def load(self, state):
+        """Hold what a `state` holds."""
+        kept, self.count = len(state["reward"]), int(state["count"])
+        self.observation[:kept], self.action[:kept], self.reward[:kept] = (
+            state[k] for k in ("observation", "action", "reward"))
+
     def sample(self, rng, batch, steps, task):
         """Segments drawn evenly, float32; three quarters of reacher's with another target [D6].
 
@@ -2065,7 +2069,7 @@ def train_student(distiller, out, settings, workers):
     losses = []
     with progress("distilling", config.steps, "step", distiller.t) as bar:
         while distiller.t < config.steps:
-            if distiller.played < distiller.t * 4 // config.steps * config.own_episodes:
+            if len(distiller.own) < distiller.t * 4 // config.steps * config.own_episodes:
                 bar.set_postfix_str(f"the student plays {config.own_episodes} episodes")
                 distiller.add(own_episodes(distiller, settings["task"], workers))
             rate = learning_rate(config, distiller.t)
@@ -2088,8 +2092,8 @@ def train_student(distiller, out, settings, workers):
 
 
 def own_episodes(distiller, task, workers):
-    """The next episodes of the student's own, (T + 1, O) and (T, A) each [D9]."""
-    count, first = distiller.config.own_episodes, distiller.played
+    """The next episodes that the student plays, as `Distiller.add` takes them [D9]."""
+    count, first = distiller.config.own_episodes, len(distiller.own)
     seeds = [int(np.random.default_rng([distiller.seed, 3, first + i]).integers(2 ** 31))
              for i in range(count)]
     workers = os.cpu_count() or 1 if workers is None else workers
@@ -2097,7 +2101,7 @@ def own_episodes(distiller, task, workers):
         actors.begin(seeds, 0.0, {}, [])
         actors.play(EPISODE_STEPS, distiller.student, PlannerConfig(samples=128, iterations=4))
         actors.wait()
-        return [episode[:2] for episode in actors.collect()[0]]
+        return actors.collect()[0]
 
 
 def same_settings(found, expected, where):
@@ -2550,10 +2554,7 @@ class Training:
         """(header, arrays) that a resumed run needs; `load` takes them back."""
         arrays = {f"{name} {k}": v for name, part in self.optimizers().items()
                   for k, v in part.state().items()}
-        kept = len(self.buffer)
-        arrays.update(slow=self.learner.slow_vector, count=np.int64(self.buffer.count),
-                      observation=self.buffer.observation[:kept],
-                      action=self.buffer.action[:kept], reward=self.buffer.reward[:kept])
+        arrays.update(slow=self.learner.slow_vector, **self.buffer.state())
         return {"kind": "checkpoint", "settings": self.settings, "decisions": self.decisions,
                 "updates": self.updates, "seconds": self.seconds, "curve": self.curve}, arrays
 
@@ -2566,10 +2567,7 @@ class Training:
         for name, part in self.optimizers().items():
             part.load({k[len(name) + 1:]: v for k, v in arrays.items() if k.startswith(name + " ")})
         self.learner.slow_vector[:] = arrays["slow"]
-        kept = len(arrays["reward"])
-        self.buffer.count = int(arrays["count"])
-        self.buffer.observation[:kept], self.buffer.action[:kept], self.buffer.reward[:kept] = (
-            arrays[k] for k in ("observation", "action", "reward"))
+        self.buffer.load(arrays)
         self.decisions, self.seconds, self.curve = (header[k] for k in ("decisions", "seconds",
                                                                         "curve"))
 

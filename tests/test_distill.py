@@ -66,8 +66,8 @@ def test_same_seed_same_student(replay):
 
 def own_episode(observation):
     """An episode of one observation and one action."""
-    shape = fac.EPISODE_STEPS + 1, 8
-    return np.full(shape, observation, np.float32), np.full((shape[0] - 1, 3), 0.25, np.float32)
+    steps = fac.EPISODE_STEPS
+    return np.full((steps + 1, 8), observation), np.full((steps, 3), 0.25), np.zeros(steps)
 
 
 def go_on(distiller, steps):
@@ -99,7 +99,7 @@ def test_a_share_of_each_batch_is_the_students_own(replay):
     before = distiller.batch(7)
     distiller.add([own_episode(7), own_episode(8)])
     distiller.add([own_episode(9)])
-    assert distiller.played == 3
+    assert len(distiller.own) == 3
     seen = set()
     for t in range(20):
         (features,), actions, _ = distiller.batch(t)
