@@ -113,9 +113,9 @@ class PlannerConfig:
                          paper=3)
     value_at: str = field("auto", "where Q ends the return: after (Equation 2: H rewards, then Q "
                           "of action H + 1), last (authors' code: Q of action H, alone if H is 1), "
-                          "both (the mean of these two) or auto: after for experts, both for "
-                          "students [D5]",
-                          paper="after", choices=("auto", "after", "last", "both"))
+                          "turns (these two, decision by decision) or auto: after for experts, "
+                          "turns for students [D5]",
+                          paper="after", choices=("auto", "after", "last", "turns"))
     discount: float = field(0.99, "gamma (Table 2)")
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)")
     max_std: float = field(2.0, "first and largest sampling deviation (Table 2)")
@@ -143,32 +143,30 @@ class PlannerConfig:
     @property
     def rewards(self):
         """Rewards in the return; the sequence has one action more, which only Q sees."""
-        if self.value_at == "auto":
-            raise UserError("planner: value_at auto depends on the model; choose after, last or "
-                            "both")
+        if self.value_at not in ("after", "last"):
+            raise UserError(f"planner: value_at {self.value_at} depends on the "
+                            f"{'model' if self.value_at == 'auto' else 'decision'}; choose after "
+                            f"or last")
         return self.horizon - (self.value_at == "last")
 
     @property
-    def weights(self):
-        """What the return is summed with: the rewards' weights, and {h: weight of Q}."""
-        rewards = float(self.discount) ** np.arange(self.rewards)
-        values = {self.rewards: self.discount ** self.rewards}
-        if self.value_at == "both":  # Q of action H is an estimate of all that follows, too
-            rewards[-1] /= 2
-            values = {h: self.discount ** h / 2 for h in (self.horizon - 1, self.horizon)}
-        return rewards.tolist(), values
+    def turns(self):
+        """What successive decisions plan with, over and over: this, or both forms of "turns"."""
+        if self.value_at != "turns":
+            return (self,)
+        return tuple(dataclasses.replace(self, value_at=form) for form in ("after", "last"))
 
     def settled(self, model):
         """This, with "auto" replaced by what suits the model: only experts have a policy."""
         if self.value_at != "auto":
             return self
-        return dataclasses.replace(self, value_at="after" if model.has_policy else "both")
+        return dataclasses.replace(self, value_at="after" if model.has_policy else "turns")
 
 
 @dataclass(frozen=True)
 class DistillConfig:
     """Algorithm 1. `--preset paper` takes each field's paper value."""
-    steps: int = field(30_000, "gradient steps [D1]", paper=100_000)
+    steps: int = field(20_000, "gradient steps [D1]", paper=100_000)
     batch_size: int = field(32, "B: states in a step [D1]", paper=512)
     noise_samples: int = field(5, "K: perturbations of each action (section 4.4) [D1]", paper=10)
     noise_std: float = field(2.0, "largest deviation of the perturbations [D8]", paper=0.5)
@@ -221,10 +219,18 @@ class DistillConfig:
         for name in ("new_targets", "own_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise UserError(f"distillation: {name} is a share, not {getattr(self, name)}")
+        if self.terms > EPISODE_STEPS:
+            raise UserError(f"distillation: horizon must be below an episode's {EPISODE_STEPS}, "
+                            f"not {self.horizon}")
         if not 0 < self.held_out <= 0.5:
             raise UserError(f"distillation: held_out must lie between 0 and 0.5, not "
                             f"{self.held_out}")
         check_choices(self)
+
+    @property
+    def terms(self):
+        """Steps h of the loss: one more than transitions of the latent rollout."""
+        return self.horizon + self.final_term
 
 
 @dataclass(frozen=True)
@@ -922,8 +928,8 @@ class Distiller:
     """
 
     def __init__(self, expert, replay, config, num_agents=None, seed=0):
-        sizes, self.steps = expert.config, config.horizon + config.final_term
-        self.train_starts, self.held_out_starts = replay.starts(self.steps, config.held_out)
+        sizes = expert.config
+        self.train_starts, self.held_out_starts = replay.starts(config.terms, config.held_out)
         if (replay.dim_obs, replay.dim_action) != (sizes.dim_obs, sizes.dim_action):
             raise UserError(f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, "
                             f"{replay.dim_action}), the expert expects ({sizes.dim_obs}, "
@@ -934,6 +940,7 @@ class Distiller:
         self.optimizer, self.student = new_student(expert, agents, config, seed)
         self.replay, self.own = replay, ReplayBuffer(  # [D9]
             sizes.dim_obs, sizes.dim_action, 3 * config.own_episodes * EPISODE_STEPS, np.float16)
+        self.own_count = round(config.own_share * config.batch_size) if config.own_episodes else 0
         self._teacher, self._next = ThreadPoolExecutor(1), None
         self._arenas = Arena(), Arena()  # the student's and the teacher's
 
@@ -941,11 +948,11 @@ class Distiller:
         """Line 4 and the expert's part of step t: features, perturbed actions, targets."""
         rng = np.random.default_rng([self.seed, t])
         starts = rng.choice(self.train_starts, self.config.batch_size)
-        obs, actions = self.replay.sequences(starts, self.steps)
+        obs, actions = self.replay.sequences(starts, self.config.terms)
         if len(self.own):  # the first ones are the student's own [D9]
-            count = int(self.config.own_share * len(starts))
-            own, actions[..., :count], _ = self.own.sample(rng, count, self.steps, "")
-            obs[:, :count] = own[0]
+            own, actions[..., :self.own_count], _ = self.own.sample(
+                rng, self.own_count, self.config.terms, "")
+            obs[:, :self.own_count] = own[0]
         task = self.replay.header.get("task", "")
         if task.startswith("reacher"):  # [D7]
             chosen = rng.random(len(starts)) < self.config.new_targets
@@ -971,11 +978,9 @@ class Distiller:
 
     def add(self, episodes):
         """Let episodes that the student played, as `ReplayBuffer.add` takes them, join the data."""
-        if self._next:
-            self._next.result()  # drawn without them
         for episode in episodes:
             self.own.add(*episode)
-        self._next = None
+        self._next = None  # drawn without them
 
     def state(self):
         """Everything that a resumed run needs."""
@@ -990,6 +995,7 @@ class Distiller:
     def close(self):
         """Stop the teacher's thread and give BLAS its threads back."""
         self._teacher.shutdown(wait=True, cancel_futures=True)
+        self._next = None
         self._threads.restore_original_limits()
 
 
@@ -1020,7 +1026,7 @@ def rank_correlation(distiller, states, seed):
     rng = np.random.default_rng(seed)
     starts = rng.choice(distiller.held_out_starts, states)
     student, config = distiller.student, dataclasses.replace(distiller.config, noise_samples=32)
-    sequences = distiller.replay.sequences(starts, distiller.steps)
+    sequences = distiller.replay.sequences(starts, distiller.config.terms)
     features, actions, (_, *q_expert) = perturbed_batch(distiller.expert, student, *sequences,
                                                         config, rng)
     _, *q_student = predict(student, student.encode_features(features), actions)
@@ -1035,22 +1041,18 @@ def rank_correlation(distiller, states, seed):
 
 
 def h_step_return(model, z, actions, config):
-    """Equation 2 for every agent, or its kin [D5], as it reads; `Returns` computes it faster.
+    """Equation 2 for every agent, as it reads; `Returns` computes it faster.
 
-    z (N, m, 1), actions (N, L, d, S) -> G (N, S), summed with `config.weights`. Q is the mean of
-    the two: unlike TD-MPC's minimum, a mean of sums is the sum of means, as Proposition 1 needs
-    [D4].
+    z (N, m, 1), actions (N, L, d, S) -> G (N, S). Q is the mean of the two: unlike TD-MPC's
+    minimum, a mean of sums is the sum of means, as Proposition 1 needs [D4].
     """
     z = np.repeat(z, actions.shape[-1], axis=2)
-    total, (rewards, values) = 0.0, config.weights
-    for h in range(len(rewards) + 1):
-        if h in values:
-            q1, q2 = model.q(z, actions[:, h])
-            total = total + values[h] * (q1 + q2) / 2
-        if h < len(rewards):
-            total = total + rewards[h] * model.reward(z, actions[:, h])
-            z = model.next(z, actions[:, h])
-    return total
+    total = 0.0
+    for h in range(config.rewards):
+        total = total + config.discount ** h * model.reward(z, actions[:, h])
+        z = model.next(z, actions[:, h])
+    q1, q2 = model.q(z, actions[:, config.rewards])
+    return total + config.discount ** config.rewards * (q1 + q2) / 2
 
 
 def homogeneous(params, layer):
@@ -1075,8 +1077,8 @@ class Returns:
     all samples start from one latent. LayerNorm's mean and gain are folded into the weights.
     """
 
-    def __init__(self, model, config):
-        self.weights, self.sizes, p = config.weights, model.config, model.params
+    def __init__(self, model):
+        self.sizes, p = model.config, model.params
         step, both_q = ("_dynamics", "_reward"), ("_Q1", "_Q2")
         self.first = [side_by_side(p, step, 0), self._fold_norm(p)]     # (N, 2h + 2, m + d + 1)
         self.second = [[homogeneous(p, f"{name}.{i}") for name in pair]  # (N, h + 1, h + 1)
@@ -1109,9 +1111,9 @@ class Returns:
         self.spread = (1 / (self.sizes.mlp_dim * gain ** 2)).swapaxes(2, 3)
         return W.reshape(len(W), -1, W.shape[-1])
 
-    def start(self, z):
+    def start(self, z, config):
         """Plan from the latent z (N, m, 1): at h = 0 the first products read (a, 1) only."""
-        m = self.sizes.latent_dim
+        self.config, m = config, self.sizes.latent_dim
         self.first_at_start = [W[:, :, m:].copy() for W in self.first]  # (N, 2h + 2, d + 1)
         for W, at_start in zip(self.first, self.first_at_start):
             at_start[..., -1:] += W[:, :, :m] @ z
@@ -1138,20 +1140,19 @@ class Returns:
         if width not in self._buffers:
             self._buffers[width] = self._make_buffers(width)
         x, y, y2, out = self._buffers[width]                            # x is (z, a, 1)
-        rewards, values = self.weights
-        for h in range(len(rewards) + 1):
+        for h in range(self.config.rewards):
             x[:, m:-1] = actions[:, h]
-            if h in values:
-                self._hidden(1, h, x, y, y2)
-                np.matmul(self.to_q, y2, out=out)
-                out *= values[h]
-                total += out[:, 0]
-            if h < len(rewards):
-                self._hidden(0, h, x, y, y2)
-                np.matmul(self.to_reward, y2[:, half:], out=out)
-                out *= rewards[h]
-                total += out[:, 0]
-                np.matmul(self.to_latent, y2[:, :half], out=x[:, :m])
+            self._hidden(0, h, x, y, y2)
+            np.matmul(self.to_reward, y2[:, half:], out=out)
+            out *= self.config.discount ** h
+            total += out[:, 0]
+            np.matmul(self.to_latent, y2[:, :half], out=x[:, :m])
+        h = self.config.rewards
+        x[:, m:-1] = actions[:, h]
+        self._hidden(1, h, x, y, y2)
+        np.matmul(self.to_q, y2, out=out)
+        out *= self.config.discount ** h
+        total += out[:, 0]
 
     def _hidden(self, pair, h, x, y, y2):
         """Both hidden layers of a pair of networks (0: dynamics and reward, 1: the two Q)."""
@@ -1223,40 +1224,42 @@ class AgentPlanner:
     """Plans for the agents of one model: the same for all of them, for a share, for N = 1."""
 
     def __init__(self, model, config):
-        self.model, self.config = model, config.settled(model)
-        self.returns = Returns(model, self.config)
+        self.model, self.turns = model, config.settled(model).turns
+        self.returns = Returns(model)
         self.reset([])
 
     def reset(self, seeds):
         """Forget the warm start; seeds: one SeedSequence for each agent, [] to keep streams."""
-        sizes = self.model.config
-        self.mean = np.zeros((sizes.num_agents, self.config.rewards + 1, sizes.agent_actions), F32)
+        sizes, length = self.model.config, self.turns[0].rewards + 1
+        self.t, self.mean = 0, np.zeros((sizes.num_agents, length, sizes.agent_actions), F32)
         if len(seeds):
             self.rngs = [np.random.Generator(np.random.SFC64(s)) for s in seeds]
 
     def plan(self, z):
         """z (N, m, 1) -> the agents' first actions (N, d); keeps the warm start."""
-        self.returns.start(z)
-        mean, elites, weights = mppi(self.returns, self.mean, self.config, self.rngs,
-                                     self._proposals(z))
-        self.mean[:, :-1] = mean[:, 1:]
-        self.mean[:, -1] = 0
-        if self.config.output == "mean":
+        config = self.turns[self.t % len(self.turns)]
+        self.t, length = self.t + 1, config.rewards + 1
+        self.returns.start(z, config)
+        mean, elites, weights = mppi(self.returns, self.mean[:, :length], config, self.rngs,
+                                     self._proposals(z, config))
+        self.mean[:] = 0
+        self.mean[:, :length - 1] = mean[:, 1:]
+        if config.output == "mean":
             return mean[:, 0]
         pick = [min(np.searchsorted(np.cumsum(w), rng.random()), len(w) - 1)
                 for w, rng in zip(weights, self.rngs)]
         return np.stack([e[0, :, i] for e, i in zip(elites, pick)])
 
-    def _proposals(self, z):
+    def _proposals(self, z, config):
         """Noisy policy rollouts (1, L, A, P), where there is a policy (TD-MPC's code)."""
-        if not (self.model.has_policy and self.config.pi_trajs):
+        if not (self.model.has_policy and config.pi_trajs):
             return None
-        z, actions = np.repeat(z, self.config.pi_trajs, 2), []
-        for h in range(self.config.rewards + 1):
+        z, actions = np.repeat(z, config.pi_trajs, 2), []
+        for h in range(config.rewards + 1):
             mu = self.model.policy(z)
-            noise = self.rngs[0].standard_normal(mu.shape, F32) * self.config.min_std
+            noise = self.rngs[0].standard_normal(mu.shape, F32) * config.min_std
             actions.append(np.clip(mu + np.clip(noise, -0.3, 0.3), -1, 1))
-            if h < self.config.rewards:
+            if h < config.rewards:
                 z = self.model.next(z, actions[-1])
         return np.stack(actions, 1)
 
@@ -1308,11 +1311,11 @@ class Planner:
     @property
     def warm_start(self):
         """What an episode hands to its next decision, where all is planned in this process."""
-        return self._own.mean, self._own.rngs
+        return self._own.mean, self._own.rngs, self._own.t
 
     @warm_start.setter
     def warm_start(self, state):
-        self._own.mean, self._own.rngs = state
+        self._own.mean, self._own.rngs, self._own.t = state
 
     def act(self, obs):
         """obs (O,), anything that converts to float32 -> action (A,) float32 in [-1, 1]."""
@@ -1408,7 +1411,7 @@ class Workers:
         try:  # plain pickle: the connection's own takes half of a hand-over
             self._members[i][1].send_bytes(pickle.dumps(message))
         except (BrokenPipeError, ConnectionResetError):
-            self._died(i)
+            self.receive(i)  # raises what it ended with
 
     def receive(self, i):
         """The next message of worker i; WorkerError as soon as it has died."""
@@ -1846,7 +1849,7 @@ class Replay:
 
 
 class ReplayBuffer:
-    """Whole episodes in fixed memory, to train an expert on; the oldest go when it is full.
+    """Whole episodes in fixed memory, to learn from; the oldest go when it is full.
 
     observation (E, T + 1, O), action (E, T, A), reward (E, T) with T = EPISODE_STEPS; capacity in
     transitions; `count` episodes have been added so far.
@@ -1971,26 +1974,32 @@ def check_task(sizes, task):
 def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="evaluating"):
     """Returns of `episodes` episodes, run side by side in `workers` processes (0: in this one).
 
-    Gives {"returns", "seeds", "seed", "planner", "plan_ms_median"}; planner: the settled settings.
+    Gives {"returns", "seeds", "seed", "planner" (the settled settings), "plan_ms_median" (of the
+    episodes' mean decisions)}.
     An episode depends on its seed alone, so the returns are the same for every number of workers.
     """
     check_task(model.config, task)
     if episodes < 1:
         raise UserError(f"episodes must be at least 1, not {episodes}")
     seeds = episode_seeds(seed, episodes)
-    workers = min(os.cpu_count() or 1 if workers is None else workers, episodes)
-    returns, seconds = np.zeros(episodes), []
+    workers = worker_count(workers, episodes)
+    returns, seconds = np.zeros(episodes), np.zeros(episodes)
     with progress(label, episodes * EPISODE_STEPS, "decision") as bar:
         for i, part in _decisions(model, task, config, seeds, workers):
             returns[i] += sum(reward for reward, _ in part)
-            seconds += [s for _, s in part]
+            seconds[i] += sum(s for _, s in part)
             bar.update(len(part))
-            if len(seconds) >= EPISODE_STEPS:
+            if bar.n >= EPISODE_STEPS:
                 bar.set_postfix_str(f"mean return so far about "
-                                    f"{returns.sum() * EPISODE_STEPS / len(seconds):.0f}", False)
+                                    f"{returns.sum() * EPISODE_STEPS / bar.n:.0f}", False)
     return {"returns": [float(r) for r in returns], "seeds": seeds, "seed": seed,
             "planner": dataclasses.asdict(config.settled(model)),
-            "plan_ms_median": 1e3 * float(np.median(seconds))}
+            "plan_ms_median": 1e3 / EPISODE_STEPS * float(np.median(seconds))}
+
+
+def worker_count(workers, episodes):
+    """As many processes as asked for, or as there are cores, but no more than episodes."""
+    return min(os.cpu_count() or 1 if workers is None else workers, episodes)
 
 
 def _decisions(model, task, config, seeds, workers):
@@ -2025,7 +2034,7 @@ def progress(label, total, unit, initial=0):
     """A progress bar on stderr with rate and remaining time."""
     from tqdm import tqdm
     return tqdm(desc=label, total=total, initial=initial, unit=unit, file=sys.stderr,
-                dynamic_ncols=True, smoothing=0.1,
+                dynamic_ncols=True, smoothing=0.1, leave=None,  # one below another vanishes
                 mininterval=0.5 if sys.stderr.isatty() else 20)
 
 
@@ -2051,11 +2060,12 @@ CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correla
          "rank_correlation_last")
 
 
-def train_student(distiller, out, settings, workers):
+def train_student(distiller, out, settings, playing, workers):
     """Algorithm 1 to its end, with a learning curve and checkpoints in `out`.
 
     A run that was cut off goes on from its checkpoint and ends as if it had not been. Returns
-    (curve rows, seconds). workers: processes that play the student's own episodes [D9].
+    (curve rows, seconds). playing, workers: the planner and the processes of the student's own
+    episodes [D9].
     """
     checkpoint, config = out / "checkpoint.npz", distiller.config
     curve, before = [], 0.0
@@ -2069,9 +2079,9 @@ def train_student(distiller, out, settings, workers):
     losses = []
     with progress("distilling", config.steps, "step", distiller.t) as bar:
         while distiller.t < config.steps:
-            if len(distiller.own) < distiller.t * 4 // config.steps * config.own_episodes:
-                bar.set_postfix_str(f"the student plays {config.own_episodes} episodes")
-                distiller.add(own_episodes(distiller, settings["task"], workers))
+            if distiller.own_count and (
+                    len(distiller.own) < distiller.t * 4 // config.steps * config.own_episodes):
+                distiller.add(own_episodes(distiller, settings["task"], playing, workers))
             rate = learning_rate(config, distiller.t)
             losses.append(distiller.step())
             bar.update()
@@ -2091,16 +2101,19 @@ def train_student(distiller, out, settings, workers):
     return curve, before + time.time() - began
 
 
-def own_episodes(distiller, task, workers):
+def own_episodes(distiller, task, playing, workers):
     """The next episodes that the student plays, as `Distiller.add` takes them [D9]."""
     count, first = distiller.config.own_episodes, len(distiller.own)
     seeds = [int(np.random.default_rng([distiller.seed, 3, first + i]).integers(2 ** 31))
              for i in range(count)]
-    workers = os.cpu_count() or 1 if workers is None else workers
-    with contextlib.closing(Actors(task, max(1, min(workers, count)))) as actors:
+    part = EPISODE_STEPS // 20
+    with contextlib.closing(Actors(task, worker_count(workers, count) or 1)) as actors, \
+            progress("the student plays", count * EPISODE_STEPS, "decision") as bar:
         actors.begin(seeds, 0.0, {}, [])
-        actors.play(EPISODE_STEPS, distiller.student, PlannerConfig(samples=128, iterations=4))
-        actors.wait()
+        for _ in range(0, EPISODE_STEPS, part):
+            actors.play(part, distiller.student, playing)
+            actors.wait()
+            bar.update(part * count)
         return actors.collect()[0]
 
 
@@ -2189,6 +2202,14 @@ def output_folder(path):
     return Path(path)
 
 
+def check_dynamics(config, planning):
+    """UserError if a student would plan with dynamics that distillation leaves as they were."""
+    if config.terms == 1 and planning.turns[0].rewards:
+        raise UserError("horizon 1 without the final term distils no dynamics, which the student "
+                        "plans with; raise the horizon, keep the term, or have distill plan with "
+                        "--plan-value-at last")
+
+
 def command_distill(args):
     """distill: expert and replay in, student, learning curve, table and JSON out."""
     began = time.time()
@@ -2206,14 +2227,18 @@ def command_distill(args):
             raise UserError(f"{expert_path}: header: {key}: expected {expected!r}, found "
                             f"{header.get(key)!r}")
     check_task(expert.config, args.task)
+    Environment(args.task)  # what is missing is missed now, not after a quarter of the steps
     replay = Replay(args.replay or data_file(args.task, "replay.npz"))
     out = output_folder(args.out or f"runs/{args.task}-{args.seed}")
     distiller = Distiller(expert, replay, config, args.num_agents, args.seed)
     num_agents = distiller.student.config.num_agents
+    check_dynamics(config, planning.settled(distiller.student))
+    playing = dataclasses.replace(planning, samples=64, iterations=3, elites=8)  # cheap [D9]
     beside = useful_workers(num_agents) if args.plan_workers is None else args.plan_workers
     shares(num_agents, beside)  # refuses too many
     settings = {"task": args.task, "seed": args.seed, "num_agents": num_agents,
                 "distill": dataclasses.asdict(config),
+                "own_planner": dataclasses.asdict(playing) if distiller.own_count else None,
                 "data": [checksum(expert.params.values()),
                          checksum([replay.observation, replay.action])]}
     print(f"{args.task}: {num_agents} agents of {distiller.student.config.latent_dim} latent "
@@ -2221,7 +2246,7 @@ def command_distill(args):
           f"{replay.transitions:,} transitions; {config.steps:,} steps of {config.batch_size} x "
           f"{config.noise_samples}; results in {out}", file=sys.stderr)
     with contextlib.closing(distiller):
-        curve, seconds = train_student(distiller, out, settings, args.workers)
+        curve, seconds = train_student(distiller, out, settings, playing, args.workers)
         rank = rank_correlation(distiller, 256, args.seed)
     student = distiller.student
     save_model(out / "student.npz", student, {"kind": "student", **settings})
@@ -2241,9 +2266,9 @@ def command_distill(args):
     obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
     with Planner(expert, alike) as central, Planner(student, alike) as alone, \
             Planner(student, alike, workers=beside) as parallel, Planner(expert, own) as usual:
-        timed, _ = take_turns([functools.partial(planner.act, obs) for planner in
-                               (central, alone, parallel, usual)], 20, "timing")
-        ms = (1e3 * np.median(timed, 0)).tolist()
+        timed, _ = take_turns([lambda planner=planner: (planner.act(obs), planner.act(obs))
+                               for planner in (central, alone, parallel, usual)], 20, "timing")
+        ms = (1e3 / 2 * np.median(timed, 0)).tolist()  # two: both of `PlannerConfig.turns`
     if not beside or (args.plan_workers is None and ms[2] >= ms[1]):
         beside, ms[2] = 0, ms[1]  # handing over costs more than it saves
 
@@ -2409,7 +2434,7 @@ class OnlineStudent:
         config, t = self.config, self.optimizer.adam.t
         self._arena.rewind()
         batch = perturbed_batch(self.expert, self.model, obs,
-                                actions[:config.horizon + config.final_term], config,
+                                actions[:config.terms], config,
                                 np.random.default_rng([self.seed, t]), self._arena.empty)
         losses = distill_loss(self.model, *batch, config, self.optimizer.grads, self._arena.empty)
         self.optimizer.step(learning_rate(config, t), config.grad_clip)
@@ -2605,10 +2630,11 @@ def command_train(args):
     else:
         args.num_agents = dim_action if args.num_agents is None else args.num_agents
         distilling = dataclasses.replace(distilling, steps=max(1, total))
-        if distilling.horizon + distilling.final_term > config.horizon:
-            raise UserError(f"the student looks {distilling.horizon + distilling.final_term} steps "
-                            f"ahead, the expert's batches hold {config.horizon}; lower "
-                            f"--distill-horizon or raise --horizon")
+        if distilling.terms > config.horizon:
+            raise UserError(f"the student looks {distilling.terms} steps ahead, the expert's "
+                            f"batches hold {config.horizon}; lower --distill-horizon or raise "
+                            f"--horizon")
+        check_dynamics(distilling, PlannerConfig(value_at="turns"))
     out = output_folder(args.out or f"runs/train-{args.task}-{args.seed}")
     training, checkpoint = Training(args, config, planning, distilling), out / "checkpoint.npz"
     if checkpoint.exists():
@@ -2771,8 +2797,7 @@ def multiply_adds(config, planner):
     cost = {name: agents * sum(a * b for a, b in zip(widths, widths[1:]))
             for name, _, agents, widths in networks(config)}
     step, value = cost["_dynamics"] + cost["_reward"], cost["_Q1"] + cost["_Q2"]
-    rewards, values = planner.weights
-    return planner.samples * planner.iterations * (len(rewards) * step + len(values) * value)
+    return planner.samples * planner.iterations * (planner.rewards * step + value)
 
 
 def benchmark_prediction(robot, workers, runs):
@@ -2872,8 +2897,9 @@ def command_benchmark(args):
             raise UserError(f"unknown robot {robot!r}; known: {', '.join(ROBOTS)}")
     if args.runs < 10:
         raise UserError(f"runs must be at least 10, not {args.runs}")
-    if planning.value_at == "auto":
-        raise UserError("value_at must be after, last or both here: both models plan alike")
+    if planning.value_at not in ("after", "last"):
+        raise UserError(f"value_at must be after or last here, not {planning.value_at}: both "
+                        f"models plan alike, every decision")
     if args.figure:
         pyplot()  # before the work, not after it
     prediction, decision, hand_overs = [], [], []
@@ -3014,7 +3040,7 @@ def make_parser():
     sub.add_argument("--episodes", type=int, default=20, help="evaluation episodes [20]")
     sub.add_argument("--eval-seed", type=natural, default=0, help="of the evaluation episodes [0]")
     sub.add_argument("--workers", type=natural, help="processes that run episodes side by side; 0: "
-                     "all in this one [cores]")
+                     "the evaluation's in this one [cores]")
     sub.add_argument("--plan-workers", type=natural, help="processes beside this one that plan for "
                      "a share of the agents, where planning is timed [one for every further core "
                      "if that is faster than none]")
@@ -3098,8 +3124,8 @@ def main(argv=None):
             paper = paper_preset(PlannerConfig) if args.command == "benchmark" else {}
             args.configs = (from_args(PlannerConfig, args, **paper),)
         result = args.run(args)
-    except UserError as error:
-        print(f"fac_tdmpc_ref.py: error: {error}", file=sys.stderr)
+    except (UserError, MemoryError) as error:
+        print(f"fac_tdmpc_ref.py: error: {str(error) or 'not enough memory'}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("fac_tdmpc_ref.py: interrupted" + (

@@ -189,7 +189,7 @@ class Learner:
 
         obs (E, O); mean (L, E, A) is the warm start. Returns actions (E, A) and the new mean.
         """
-        length, (rewards, values) = len(mean), planner.weights
+        length = len(mean)
         z0 = self.model.encode(obs)
         num_env, samples = len(obs), planner.samples
         pi_trajs, dim_action = planner.pi_trajs, mean.shape[-1]
@@ -206,12 +206,10 @@ class Learner:
             actions = (mean[:, :, None] + std[:, :, None] * noise).clamp(-1, 1)
             actions = torch.cat([actions, proposals], 2)
             flat, z, value = actions.flatten(1, 2), start, 0.0
-            for h in range(length):
-                if h in values:
-                    value = value + values[h] * sum(self.model.q(z, flat[h])) / 2
-                if h < len(rewards):
-                    z, r = self.model.next(z, flat[h])
-                    value = value + rewards[h] * r
+            for h in range(length - 1):
+                z, r = self.model.next(z, flat[h])
+                value = value + planner.discount ** h * r
+            value = value + planner.discount ** (length - 1) * sum(self.model.q(z, flat[-1])) / 2
             value = value.view(num_env, -1).nan_to_num()
             top, index = value.topk(planner.elites, 1)
             elites = actions.gather(2, index[None, :, :, None].expand(
@@ -255,11 +253,11 @@ def train(args, config, planner):
         learner.load(saved["learner"])
         decisions, seconds = saved["decisions"], saved["seconds"]
         elapsed = seconds
-        count = saved["obs"].shape[0]
-        replay.observation[:count], replay.action[:count] = saved["obs"], saved["action"]
-        replay.reward[:count], replay.count = saved["reward"], saved["count"]
+        replay.load({**saved, "observation": saved["obs"]})
         rng.bit_generator.state = saved["rng"]
         torch.set_rng_state(saved["torch_rng"].cpu())
+        if torch.cuda.is_available():
+            torch.cuda.set_rng_state_all([state.cpu() for state in saved.get("cuda_rng", [])])
 
     def to_device(x):
         return torch.as_tensor(np.ascontiguousarray(x), device=args.device)
@@ -313,8 +311,6 @@ def train(args, config, planner):
             if warming and decisions >= config.seed_decisions:  # catch up on the random episodes
                 for _ in tqdm(range(int(config.updates_per_step * decisions)), desc="first updates",
                               leave=False):
-                    if out_of_time():
-                        break
                     losses.append(learn(std))
             recent = [[float(x) for x in row] for row in losses[-100:]]
             terms = np.mean(recent or [[0] * 3], 0)
@@ -336,7 +332,8 @@ def train(args, config, planner):
                      "seconds": elapsed, "obs": replay.observation[:kept],
                      "action": replay.action[:kept], "reward": replay.reward[:kept],
                      "count": replay.count, "rng": rng.bit_generator.state,
-                     "torch_rng": torch.get_rng_state()}
+                     "torch_rng": torch.get_rng_state(),
+                     "cuda_rng": torch.cuda.get_rng_state_all()}
             with fac.atomic_file(checkpoint) as file:
                 torch.save(state, file)
     return learner, replay, decisions, elapsed / 60, decisions >= args.decisions
@@ -581,10 +578,11 @@ def write_narrow_golden(path):
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--task", default="reacher-hard")
-    parser.add_argument("--decisions", type=int, default=100_000,
+    parser.add_argument("--decisions", type=fac.natural, default=100_000,
                         help="decisions in all, two environment steps each [100000]")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--envs", type=int, default=8, help="environments stepped side by side [8]")
+    parser.add_argument("--seed", type=fac.natural, default=1)
+    parser.add_argument("--envs", type=fac.natural, default=8,
+                        help="environments stepped side by side [8]")
     parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 1) // 2),
                         help="processes that step them, at least one")
     parser.add_argument("--threads", type=int, default=0, help="PyTorch threads; 0: its default")
@@ -601,6 +599,10 @@ def main(argv=None):
     args = parser.parse_args(argv)
     args.out = args.out or f"runs/expert-{args.task}"
     try:
+        if not args.decisions >= args.envs * fac.EPISODE_STEPS > 0:
+            raise fac.UserError(f"--decisions {args.decisions} and --envs {args.envs}: needs at "
+                                f"least one environment and an episode ({fac.EPISODE_STEPS} "
+                                f"decisions) in each")
         config = fac.from_args(fac.ExpertConfig, args)
         planner = fac.from_args(fac.PlannerConfig, args, **few)
         learner, replay, decisions, minutes, done = train(args, config, planner)

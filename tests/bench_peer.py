@@ -156,8 +156,7 @@ class TorchDistiller:
     def step(self):
         """One gradient step on a fresh batch; returns the loss."""
         config = self.config
-        steps, batch, noise = config.horizon + config.final_term, config.batch_size, \
-            config.noise_samples
+        steps, batch, noise = config.terms, config.batch_size, config.noise_samples
         with torch.no_grad():
             rows = self.starts[torch.randint(len(self.starts), (batch,))]
             actions = self.action[rows + torch.arange(steps)[:, None]].repeat_interleave(noise, 1)

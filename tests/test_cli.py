@@ -139,7 +139,7 @@ except SystemExit as end:
     ((), ["distill", "evaluate", "benchmark"]),
     (("benchmark",), ["--robots", "humanoid", "--figure", "--iterations", "[3; paper: 3]"]),
     (("distill",), ["--task", "--preset", "--num-agents", "--evaluate-expert", "--plan-samples",
-                    "[30000; paper: 100000]", "[forward; paper: reverse]", "reacher-hard"]),
+                    "[20000; paper: 100000]", "[forward; paper: reverse]", "reacher-hard"]),
     (("evaluate",), ["--model", "--record", "--samples", "--output", "[6]"])])
 def test_help_is_quick_and_starts_nothing(tmp_path, command, expected):
     done = succeeded(launch(["-c", WATCHED, *command, "--help"], tmp_path))
@@ -185,10 +185,12 @@ def test_preset_paper_is_the_paper(monkeypatch):
     expected = {"steps": 100_000, "batch_size": 512, "noise_samples": 10, "horizon": 3,
                 "final_term": True, "lam": 0.5, "reward_coef": 0.5, "value_coef": 0.1,
                 "kl": "reverse", "encoder_input": "observation", "lr": 1e-4,
-                "lr_schedule": "constant", "warmup": 0, "grad_clip": 10, "sizes": "table2"}
+                "lr_schedule": "constant", "warmup": 0, "grad_clip": 10, "sizes": "table2",
+                "noise_std": 0.5, "noise_std_min": 0.5, "clip_actions": False, "new_targets": 0,
+                "own_episodes": 0, "own_share": 0}
     assert {k: found[k] for k in expected} == expected
-    assert (planner.samples, planner.iterations, planner.elites, planner.pi_trajs,
-            planner.horizon, planner.discount) == (512, 6, 64, 24, 3, 0.99)
+    assert (planner.samples, planner.iterations, planner.elites, planner.pi_trajs, planner.horizon,
+            planner.discount, planner.value_at) == (512, 6, 64, 24, 3, 0.99, "after")
 
 
 def test_flags_go_before_the_preset(monkeypatch):
@@ -254,6 +256,9 @@ def refused(done, *parts):
     (["--steps", "0"], ["steps", "at least 1", "0"]),
     (["--batch-size", "0"], ["batch_size", "at least 1"]),
     (["--horizon", "0"], ["horizon", "at least 1"]),
+    (["--horizon", "500"], ["horizon", "below an episode's 500"]),
+    (["--no-final-term"], ["no dynamics", "--plan-value-at last"]),
+    (["--own-episodes", "100000000", "--own-share", "1"], ["llocate"]),
     (["--noise-samples", "1"], ["noise_samples", "at least 2"]),
     (["--noise-std", "nan"], ["noise_std", "nan"]),
     (["--lr", "0"], ["lr", "above 0"]),
@@ -291,7 +296,7 @@ def test_distill_refuses(tmp_path, files, flags, parts):
     (["evaluate"], ["--model"]),
     (["benchmark", "--robots", "reecher"], ["'reecher'", *fac.ROBOTS]),
     (["benchmark", "--runs", "9"], ["runs", "at least 10"]),
-    (["benchmark", "--value-at", "auto"], ["value_at", "after, last or both"]),
+    (["benchmark", "--value-at", "turns"], ["value_at", "after or last", "turns"]),
     (["benchmark", "--workers", "-1"], ["--workers", "-1"]),
     (["benchmark", "--elites", "600"], ["600 elites", "512 samples"]),
     (["evaluate", "--model", "none.npz"], ["none.npz", "no such file"]),
@@ -411,7 +416,7 @@ def test_distill_prints_json_and_a_table(distilled):
     table = done.stdout
     assert "expert (measured now)" in table and "student, N = 3" in table and "±" in table
     assert f"{result['speedup']:.1f}" in table and "speed-up" in table
-    assert "value_at after (expert), both (student)" in table
+    assert "value_at after (expert), turns (student)" in table
     own = result["plan_ms_expert_own"]
     assert f"{own:.1f}" in table and "expert, planning like its student" in table
 
@@ -669,6 +674,8 @@ def test_train_expert_in_stretches(tmp_path, capsys):
                                   *sizes.split(), *budget.split(), "--decisions", str(decisions),
                                   "--out", f"{tmp_path}/run", "--data", str(tmp_path), *more])
 
+    assert train(499) == 2 and "--decisions 499" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
     assert train(500) == 0
     assert train(1000, "--plan-value-at", "last", "--plan-horizon", "1") == 0
     assert len((tmp_path / "run" / "curve.csv").read_text().splitlines()) == 3

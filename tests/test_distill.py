@@ -99,7 +99,7 @@ def test_a_share_of_each_batch_is_the_students_own(replay):
     before = distiller.batch(7)
     distiller.add([own_episode(7), own_episode(8)])
     distiller.add([own_episode(9)])
-    assert len(distiller.own) == 3
+    assert len(distiller.own) == 3 and distiller.own_count == 4
     seen = set()
     for t in range(20):
         (features,), actions, _ = distiller.batch(t)

@@ -60,8 +60,8 @@ def test_one_mppi_refinement(golden):
     model, header, g = golden
     config = fac.PlannerConfig(**{**header["planner"], "iterations": 1, "momentum": 0.0})
     z = model.encode(g["obs"][0][:, :1])
-    fast = fac.Returns(model, config)
-    fast.start(z)
+    fast = fac.Returns(model)
+    fast.start(z, config)
     actions = np.clip(g["mppi_mean"][..., None] + config.max_std * g["mppi_noise"], -1, 1)[None]
     for returns in (fast(actions), fac.h_step_return(model, z, actions, config)):
         assert relative(returns[0], g["mppi_returns"]) < FORWARD

@@ -1,4 +1,5 @@
 """MPPI on problems with known answers, Proposition 1, the fast returns, and the workers."""
+import copy
 import os
 import signal
 import subprocess
@@ -76,50 +77,69 @@ def test_proposals_compete():
     assert np.allclose(mean, target)
 
 
-@pytest.mark.parametrize("value_at", ["after", "last", "both"])
+@pytest.mark.parametrize("value_at", ["after", "last"])
 @pytest.mark.parametrize("horizon", [3, 1])
 @pytest.mark.parametrize("n", [1, 3])
 def test_fast_returns_are_equation_2(n, value_at, horizon):
     model = random_model(n)
     config = fac.PlannerConfig(horizon=horizon, value_at=value_at)
     rng = np.random.default_rng(1)
-    fast = fac.Returns(model, config)
+    fast = fac.Returns(model)
     for samples in (299, 5):  # two blocks, the last narrower; then buffers of another size
         z = model.encode(rng.standard_normal((8, 1), np.float32))
         actions = rng.uniform(-1, 1, (n, config.rewards + 1, 3 // n, samples)).astype(np.float32)
-        fast.start(z)
+        fast.start(z, config)
         plain = fac.h_step_return(model, z, actions, config)
         assert fast(actions).dtype == np.float32
         assert np.abs(fast(actions) - plain).max() < 1e-5 * np.abs(plain).max()
 
 
-def test_auto_is_equation_2_for_an_expert_and_both_for_a_student():
-    for model, expected in ((random_model(1, policy=True), "after"), (random_model(1), "both"),
-                            (random_model(3), "both")):
-        obs = np.ones(8)
-        plans = {value_at: fac.Planner(model, fac.PlannerConfig(samples=16, value_at=value_at)
-                                       ).act(obs) for value_at in ("auto", "after", "last", "both")}
-        assert np.array_equal(plans.pop("auto"), plans[expected])
-        assert len({plan.tobytes() for plan in plans.values()}) == 3
+def plans(model, value_at):
+    """Successive actions for one observation."""
+    config = fac.PlannerConfig(samples=16, iterations=2, horizon=2, value_at=value_at)
+    planner = fac.Planner(model, config)
+    return np.stack([planner.act(np.ones(8)) for _ in range(3)])
+
+
+def test_auto_is_equation_2_for_an_expert_and_turns_for_a_student():
+    for model, expected in ((random_model(1, policy=True), "after"), (random_model(1), "turns"),
+                            (random_model(3), "turns")):
+        found = {form: plans(model, form) for form in ("auto", "after", "last", "turns")}
+        assert np.array_equal(found.pop("auto"), found[expected])
         assert fac.PlannerConfig().settled(model).value_at == expected
-    with pytest.raises(fac.UserError, match="depends on the model"):
-        fac.multiply_adds(model.config, fac.PlannerConfig())
+    for value_at, reason in (("auto", "model"), ("turns", "decision")):
+        with pytest.raises(fac.UserError, match=f"depends on the {reason}"):
+            fac.multiply_adds(model.config, fac.PlannerConfig(value_at=value_at))
 
 
-def test_value_at():
-    """`last` is one step shorter than `after`, `both` the mean of the two."""
+def test_value_at_last_is_one_step_shorter():
     model, rng = random_model(), np.random.default_rng(2)
     z = model.encode(rng.standard_normal((8, 1), np.float32))
-    actions = rng.uniform(-1, 1, (3, 4, 1, 7)).astype(np.float32)
+    actions = rng.uniform(-1, 1, (3, 3, 1, 7)).astype(np.float32)
+    after = fac.h_step_return(model, z, actions, fac.PlannerConfig(horizon=2, value_at="after"))
+    last = fac.h_step_return(model, z, actions, fac.PlannerConfig(horizon=3, value_at="last"))
+    assert np.array_equal(after, last)
 
-    def returns(horizon, value_at):
-        config = fac.PlannerConfig(horizon=horizon, value_at=value_at)
-        return fac.h_step_return(model, z, actions, config)
 
-    assert np.array_equal(returns(2, "after"), returns(3, "last"))
-    for horizon in (1, 3):
-        mean = (returns(horizon, "after") + returns(horizon, "last")) / 2
-        assert np.allclose(returns(horizon, "both"), mean, rtol=1e-6)
+def test_turns_plan_with_equation_2_and_one_step_less_decision_by_decision():
+    """Alone, each form would find these actions from the same warm start and random streams."""
+    model, obs = random_model(), np.ones(8, np.float32)
+    configs = {value_at: fac.PlannerConfig(samples=16, iterations=2, horizon=2, value_at=value_at)
+               for value_at in ("after", "last", "turns")}
+    planner, z = fac.AgentPlanner(model, configs["turns"]), model.encode(obs[:, None])
+    planner.reset(np.random.SeedSequence(0).spawn(3))
+    for value_at in ("after", "last", "after"):
+        alone = fac.AgentPlanner(model, configs[value_at])
+        alone.mean[:] = planner.mean[:, :alone.mean.shape[1]]
+        alone.rngs = copy.deepcopy(planner.rngs)
+        assert np.array_equal(planner.plan(z), alone.plan(z))
+        kept = alone.mean.shape[1]
+        assert np.array_equal(planner.mean[:, :kept], alone.mean)
+        assert not planner.mean[:, kept:].any()
+    planner.reset(np.random.SeedSequence(0).spawn(3))  # an episode starts with Equation 2
+    alone = fac.AgentPlanner(model, configs["after"])
+    alone.reset(np.random.SeedSequence(0).spawn(3))
+    assert np.array_equal(planner.plan(z), alone.plan(z))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -139,13 +159,13 @@ def test_proposition_1(seed):
 
 def test_warm_start_shifts_by_one():
     model = random_model()
-    planner = fac.AgentPlanner(model, fac.PlannerConfig(samples=32, iterations=1, horizon=2))
-    planner.reset(np.random.SeedSequence(0).spawn(3))
+    config = fac.PlannerConfig(samples=32, iterations=1, horizon=2, value_at="after")
+    planner, twin = fac.AgentPlanner(model, config), fac.AgentPlanner(model, config)
     z = model.encode(np.zeros((8, 1), np.float32))
-    planner.returns.start(z)
-    twin = fac.AgentPlanner(model, planner.config)
-    twin.reset(np.random.SeedSequence(0).spawn(3))
-    mean, _, _ = fac.mppi(planner.returns, planner.mean, planner.config, twin.rngs)
+    for one in (planner, twin):
+        one.reset(np.random.SeedSequence(0).spawn(3))
+    twin.returns.start(z, config)
+    mean, _, _ = fac.mppi(twin.returns, twin.mean, config, twin.rngs)
     planner.plan(z)
     assert np.array_equal(planner.mean[:, :-1], mean[:, 1:])
     assert not planner.mean[:, -1].any() and planner.mean[:, :-1].any()
@@ -294,6 +314,16 @@ def test_multiply_adds_count_the_weights_of_equation_2():
         3 * (sizes["_dynamics"] + sizes["_reward"]) + sizes["_Q"])
 
 
+def refuses(connection):
+    raise fac.UserError("not on this machine")
+
+
+def test_a_worker_that_ends_while_it_is_sent_to_says_why():
+    with fac.Workers(refuses, 1) as workers:
+        with pytest.raises(fac.UserError, match="not on this machine"):
+            workers.send(0, bytes(10_000_000))  # more than a pipe holds
+
+
 def test_handing_over_leaves_the_plan_alone():
     config, obs = fac.PlannerConfig(samples=16, iterations=1), np.ones(8, np.float32)
     with fac.Planner(random_model(), config, seed=1, workers=1) as planner:
@@ -309,7 +339,7 @@ def test_a_gain_of_zero_is_a_gain_all_the_same():
     config = fac.PlannerConfig(horizon=2, value_at="after")
     z = model.encode(rng.standard_normal((8, 1), np.float32))
     actions = rng.uniform(-1, 1, (3, 3, 1, 9)).astype(np.float32)
-    fast = fac.Returns(model, config)
-    fast.start(z)
+    fast = fac.Returns(model)
+    fast.start(z, config)
     plain = fac.h_step_return(model, z, actions, config)
     assert np.abs(fast(actions) - plain).max() < 1e-5 * np.abs(plain).max()

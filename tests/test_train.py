@@ -159,6 +159,7 @@ def test_a_killed_run_goes_on_to_the_same_result(trained, tmp_path):
     (["--updates-per-step", "nan"], ["updates_per_step", "nan"]),
     (["--mlp-dim", "0"], ["mlp_dim", "at least 1"]),
     (["--distill-horizon", "3"], ["4 steps", "hold 3"]),
+    (["--no-distill-final-term"], ["no dynamics", "final term"]),
     (["--num-agents", "2"], ["[1, 3]"]),
     (["--num-agents", "0"], ["[1, 3]"]),
     (["--horizon", "501"], ["horizon", "500"]),
