@@ -113,8 +113,8 @@ class PlannerConfig:
                          paper=3)
     value_at: str = field("auto", "where Q ends the return: after (Equation 2: H rewards, then Q "
                           "of action H + 1), last (authors' code: Q of action H, alone if H is 1), "
-                          "turns (these two, decision by decision) or auto: after for experts, "
-                          "turns for students [D5]",
+                          "turns (these two, 25 decisions each) or auto: after for experts, turns "
+                          "for students [D5]",
                           paper="after", choices=("auto", "after", "last", "turns"))
     discount: float = field(0.99, "gamma (Table 2)")
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)")
@@ -151,7 +151,7 @@ class PlannerConfig:
 
     @property
     def turns(self):
-        """What successive decisions plan with, over and over: this, or both forms of "turns"."""
+        """What plans in turn, TURN decisions each: this alone, or both forms of "turns"."""
         if self.value_at != "turns":
             return (self,)
         return tuple(dataclasses.replace(self, value_at=form) for form in ("after", "last"))
@@ -1220,6 +1220,9 @@ def mppi(returns, mean, config, rngs, proposals=None):
     return mean[..., 0], elites, weights
 
 
+TURN = 25  # decisions; when every other one undoes what the last did, a robot stays at rest [D5]
+
+
 class AgentPlanner:
     """Plans for the agents of one model: the same for all of them, for a share, for N = 1."""
 
@@ -1237,7 +1240,7 @@ class AgentPlanner:
 
     def plan(self, z):
         """z (N, m, 1) -> the agents' first actions (N, d); keeps the warm start."""
-        config = self.turns[self.t % len(self.turns)]
+        config = self.turns[self.t // TURN % len(self.turns)]
         self.t, length = self.t + 1, config.rewards + 1
         self.returns.start(z, config)
         mean, elites, weights = mppi(self.returns, self.mean[:, :length], config, self.rngs,
@@ -2264,11 +2267,13 @@ def command_distill(args):
         returns = evaluate(expert, args.task, planning, args.episodes, args.eval_seed, args.workers,
                            "evaluating the expert")["returns"]
     obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
-    with Planner(expert, alike) as central, Planner(student, alike) as alone, \
-            Planner(student, alike, workers=beside) as parallel, Planner(expert, own) as usual:
-        timed, _ = take_turns([lambda planner=planner: (planner.act(obs), planner.act(obs))
-                               for planner in (central, alone, parallel, usual)], 20, "timing")
-        ms = (1e3 / 2 * np.median(timed, 0)).tolist()  # two: both of `PlannerConfig.turns`
+    subjects = ((expert, alike, 0), (student, alike, 0), (student, alike, beside), (expert, own, 0))
+    with contextlib.ExitStack() as stack:
+        turns = [[stack.enter_context(Planner(model, turn, workers=workers))
+                  for turn in settings.turns] for model, settings, workers in subjects]
+        timed, _ = take_turns([lambda planners=planners: [p.act(obs) for p in planners]
+                               for planners in turns], 20, "timing")
+    ms = [1e3 * float(s) / len(planners) for s, planners in zip(np.median(timed, 0), turns)]
     if not beside or (args.plan_workers is None and ms[2] >= ms[1]):
         beside, ms[2] = 0, ms[1]  # handing over costs more than it saves
 

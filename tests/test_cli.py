@@ -662,6 +662,26 @@ def test_mujoco_and_dm_control_are_pinned_as_a_pair():
     assert not [name for name in names if "torch" in name or "matplotlib" in name]
 
 
+def test_the_readme_distils_an_expert_of_one_s_own(tmp_path, monkeypatch):
+    """Its code, on a checkpoint in the official form and a replay of 20 short episodes."""
+    torch = pytest.importorskip("torch")
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    fac.save_model("official.npz", fac.WorldModel.create(fac.ModelConfig(24, 6), rng, policy=True),
+                   {"kind": "expert"})
+    _, weights = fac.read_npz("official.npz", ("expert",))
+    torch.save({"model": {key: torch.tensor(value) for key, value in weights.items()}}, "model.pt")
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    _, bring, distil = re.findall(r"```python\n(.*?)```", text, re.S)
+    exec(bring, {"obs": rng.standard_normal((180, 24)).astype(np.float16),
+                 "action": rng.uniform(-1, 1, (180, 6)).astype(np.float16),
+                 "more": np.arange(180) % 9 < 8})
+    assert "own_episodes=0" in distil
+    exec(distil.replace("own_episodes=0", "own_episodes=0, steps=2"), {"fac": fac})
+    student, _ = fac.load_model("mine/student.npz")
+    assert (student.config.num_agents, student.config.dim_action) == (6, 6)
+
+
 def test_train_expert_in_stretches(tmp_path, capsys):
     """PyTorch's trainer goes on with another planner, but not with another learning rate."""
     pytest.importorskip("torch")
