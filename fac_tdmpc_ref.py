@@ -2547,7 +2547,7 @@ class Training:
     def tests(self):
         """An evaluation's models and tests, as Actors.begin takes them.
 
-        It plans with the training budget and the default horizon.
+        They plan with the training budget and the default horizon and value_at.
         """
         default = PlannerConfig()
         testing = dataclasses.replace(self.planning, horizon=default.horizon,
