@@ -113,9 +113,9 @@ class PlannerConfig:
                          paper=3)
     value_at: str = field("auto", "where Q ends the return: after (Equation 2: H rewards, then Q "
                           "of action H + 1), last (authors' code: Q of action H, alone if H is 1), "
-                          "turns (these two, 25 decisions each) or auto: after for experts, turns "
-                          "for students [D5]",
-                          paper="after", choices=("auto", "after", "last", "turns"))
+                          "both (their mean), turns (both and after, 25 decisions each) or auto: "
+                          "after for experts, turns for students [D5]",
+                          paper="after", choices=("auto", "after", "last", "both", "turns"))
     discount: float = field(0.99, "gamma (Table 2)")
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)")
     max_std: float = field(2.0, "first and largest sampling deviation (Table 2)")
@@ -141,20 +141,33 @@ class PlannerConfig:
         check_choices(self)
 
     @property
+    def ends(self):
+        """How many rewards go before Q: H, or one less, or ("both") the mean of these returns."""
+        if self.value_at in ("auto", "turns"):
+            raise UserError(f"planner: value_at {self.value_at} depends on the "
+                            f"{'model' if self.value_at == 'auto' else 'decision'}; choose after, "
+                            f"last or both")
+        return {"after": [self.horizon], "last": [self.horizon - 1],
+                "both": [self.horizon - 1, self.horizon]}[self.value_at]
+
+    @property
     def rewards(self):
         """Rewards in the return; the sequence has one action more, which only Q sees."""
-        if self.value_at not in ("after", "last"):
-            raise UserError(f"planner: value_at {self.value_at} depends on the "
-                            f"{'model' if self.value_at == 'auto' else 'decision'}; choose after "
-                            f"or last")
-        return self.horizon - (self.value_at == "last")
+        return self.ends[-1]
+
+    @property
+    def weights(self):
+        """What the return is summed with: the rewards' weights, and {h: weight of Q}."""
+        gamma, ends = float(self.discount), self.ends
+        return ([gamma ** h * sum(h < end for end in ends) / len(ends) for h in range(ends[-1])],
+                {end: gamma ** end / len(ends) for end in ends})
 
     @property
     def turns(self):
-        """What plans in turn, TURN decisions each: this alone, or both forms of "turns"."""
+        """What plans in turn, TURN decisions each: this alone, or the two forms of "turns"."""
         if self.value_at != "turns":
             return (self,)
-        return tuple(dataclasses.replace(self, value_at=form) for form in ("after", "last"))
+        return tuple(dataclasses.replace(self, value_at=form) for form in ("both", "after"))
 
     def settled(self, model):
         """This, with "auto" replaced by what suits the model: only experts have a policy."""
@@ -1041,18 +1054,22 @@ def rank_correlation(distiller, states, seed):
 
 
 def h_step_return(model, z, actions, config):
-    """Equation 2 for every agent, as it reads; `Returns` computes it faster.
+    """Equation 2 for every agent, or its kin [D5], as it reads; `Returns` computes it faster.
 
-    z (N, m, 1), actions (N, L, d, S) -> G (N, S). Q is the mean of the two: unlike TD-MPC's
-    minimum, a mean of sums is the sum of means, as Proposition 1 needs [D4].
+    z (N, m, 1), actions (N, L, d, S) -> G (N, S), summed with `config.weights`. Q is the mean of
+    the two: unlike TD-MPC's minimum, a mean of sums is the sum of means, as Proposition 1 needs
+    [D4].
     """
     z = np.repeat(z, actions.shape[-1], axis=2)
-    total = 0.0
-    for h in range(config.rewards):
-        total = total + config.discount ** h * model.reward(z, actions[:, h])
-        z = model.next(z, actions[:, h])
-    q1, q2 = model.q(z, actions[:, config.rewards])
-    return total + config.discount ** config.rewards * (q1 + q2) / 2
+    total, (rewards, values) = 0.0, config.weights
+    for h in range(len(rewards) + 1):
+        if h in values:
+            q1, q2 = model.q(z, actions[:, h])
+            total = total + values[h] * (q1 + q2) / 2
+        if h < len(rewards):
+            total = total + rewards[h] * model.reward(z, actions[:, h])
+            z = model.next(z, actions[:, h])
+    return total
 
 
 def homogeneous(params, layer):
@@ -1113,7 +1130,7 @@ class Returns:
 
     def start(self, z, config):
         """Plan from the latent z (N, m, 1): at h = 0 the first products read (a, 1) only."""
-        self.config, m = config, self.sizes.latent_dim
+        self.weights, m = config.weights, self.sizes.latent_dim
         self.first_at_start = [W[:, :, m:].copy() for W in self.first]  # (N, 2h + 2, d + 1)
         for W, at_start in zip(self.first, self.first_at_start):
             at_start[..., -1:] += W[:, :, :m] @ z
@@ -1140,19 +1157,20 @@ class Returns:
         if width not in self._buffers:
             self._buffers[width] = self._make_buffers(width)
         x, y, y2, out = self._buffers[width]                            # x is (z, a, 1)
-        for h in range(self.config.rewards):
+        rewards, values = self.weights
+        for h in range(len(rewards) + 1):
             x[:, m:-1] = actions[:, h]
-            self._hidden(0, h, x, y, y2)
-            np.matmul(self.to_reward, y2[:, half:], out=out)
-            out *= self.config.discount ** h
-            total += out[:, 0]
-            np.matmul(self.to_latent, y2[:, :half], out=x[:, :m])
-        h = self.config.rewards
-        x[:, m:-1] = actions[:, h]
-        self._hidden(1, h, x, y, y2)
-        np.matmul(self.to_q, y2, out=out)
-        out *= self.config.discount ** h
-        total += out[:, 0]
+            if h in values:
+                self._hidden(1, h, x, y, y2)
+                np.matmul(self.to_q, y2, out=out)
+                out *= values[h]
+                total += out[:, 0]
+            if h < len(rewards):
+                self._hidden(0, h, x, y, y2)
+                np.matmul(self.to_reward, y2[:, half:], out=out)
+                out *= rewards[h]
+                total += out[:, 0]
+                np.matmul(self.to_latent, y2[:, :half], out=x[:, :m])
 
     def _hidden(self, pair, h, x, y, y2):
         """Both hidden layers of a pair of networks (0: dynamics and reward, 1: the two Q)."""
@@ -1220,7 +1238,7 @@ def mppi(returns, mean, config, rngs, proposals=None):
     return mean[..., 0], elites, weights
 
 
-TURN = 25  # decisions; when every other one undoes what the last did, a robot stays at rest [D5]
+TURN = 25  # decisions that students plan with one return before the other [D5]
 
 
 class AgentPlanner:
@@ -1241,12 +1259,12 @@ class AgentPlanner:
     def plan(self, z):
         """z (N, m, 1) -> the agents' first actions (N, d); keeps the warm start."""
         config = self.turns[self.t // TURN % len(self.turns)]
-        self.t, length = self.t + 1, config.rewards + 1
+        self.t += 1
         self.returns.start(z, config)
-        mean, elites, weights = mppi(self.returns, self.mean[:, :length], config, self.rngs,
+        mean, elites, weights = mppi(self.returns, self.mean, config, self.rngs,
                                      self._proposals(z, config))
-        self.mean[:] = 0
-        self.mean[:, :length - 1] = mean[:, 1:]
+        self.mean[:, :-1] = mean[:, 1:]
+        self.mean[:, -1] = 0
         if config.output == "mean":
             return mean[:, 0]
         pick = [min(np.searchsorted(np.cumsum(w), rng.random()), len(w) - 1)
@@ -2802,7 +2820,8 @@ def multiply_adds(config, planner):
     cost = {name: agents * sum(a * b for a, b in zip(widths, widths[1:]))
             for name, _, agents, widths in networks(config)}
     step, value = cost["_dynamics"] + cost["_reward"], cost["_Q1"] + cost["_Q2"]
-    return planner.samples * planner.iterations * (planner.rewards * step + value)
+    rewards, values = planner.weights
+    return planner.samples * planner.iterations * (len(rewards) * step + len(values) * value)
 
 
 def benchmark_prediction(robot, workers, runs):
@@ -2902,8 +2921,8 @@ def command_benchmark(args):
             raise UserError(f"unknown robot {robot!r}; known: {', '.join(ROBOTS)}")
     if args.runs < 10:
         raise UserError(f"runs must be at least 10, not {args.runs}")
-    if planning.value_at not in ("after", "last"):
-        raise UserError(f"value_at must be after or last here, not {planning.value_at}: both "
+    if planning.value_at in ("auto", "turns"):
+        raise UserError(f"value_at must be after, last or both here, not {planning.value_at}: the "
                         f"models plan alike, every decision")
     if args.figure:
         pyplot()  # before the work, not after it

@@ -189,7 +189,7 @@ class Learner:
 
         obs (E, O); mean (L, E, A) is the warm start. Returns actions (E, A) and the new mean.
         """
-        length = len(mean)
+        length, (rewards, values) = len(mean), planner.weights
         z0 = self.model.encode(obs)
         num_env, samples = len(obs), planner.samples
         pi_trajs, dim_action = planner.pi_trajs, mean.shape[-1]
@@ -206,10 +206,12 @@ class Learner:
             actions = (mean[:, :, None] + std[:, :, None] * noise).clamp(-1, 1)
             actions = torch.cat([actions, proposals], 2)
             flat, z, value = actions.flatten(1, 2), start, 0.0
-            for h in range(length - 1):
-                z, r = self.model.next(z, flat[h])
-                value = value + planner.discount ** h * r
-            value = value + planner.discount ** (length - 1) * sum(self.model.q(z, flat[-1])) / 2
+            for h in range(length):
+                if h in values:
+                    value = value + values[h] * sum(self.model.q(z, flat[h])) / 2
+                if h < len(rewards):
+                    z, r = self.model.next(z, flat[h])
+                    value = value + rewards[h] * r
             value = value.view(num_env, -1).nan_to_num()
             top, index = value.topk(planner.elites, 1)
             elites = actions.gather(2, index[None, :, :, None].expand(

@@ -77,7 +77,7 @@ def test_proposals_compete():
     assert np.allclose(mean, target)
 
 
-@pytest.mark.parametrize("value_at", ["after", "last"])
+@pytest.mark.parametrize("value_at", ["after", "last", "both"])
 @pytest.mark.parametrize("horizon", [3, 1])
 @pytest.mark.parametrize("n", [1, 3])
 def test_fast_returns_are_equation_2(n, value_at, horizon):
@@ -104,7 +104,7 @@ def plans(model, value_at):
 def test_auto_is_equation_2_for_an_expert_and_turns_for_a_student():
     for model, expected in ((random_model(1, policy=True), "after"), (random_model(1), "turns"),
                             (random_model(3), "turns")):
-        found = {form: plans(model, form) for form in ("auto", "after", "last", "turns")}
+        found = {form: plans(model, form) for form in ("auto", "after", "both", "turns")}
         assert np.array_equal(found.pop("auto"), found[expected])
         assert fac.PlannerConfig().settled(model).value_at == expected
     for value_at, reason in (("auto", "model"), ("turns", "decision")):
@@ -112,33 +112,38 @@ def test_auto_is_equation_2_for_an_expert_and_turns_for_a_student():
             fac.multiply_adds(model.config, fac.PlannerConfig(value_at=value_at))
 
 
-def test_value_at_last_is_one_step_shorter():
+def test_value_at():
+    """`last` is one step shorter than `after`, `both` the mean of the two."""
     model, rng = random_model(), np.random.default_rng(2)
     z = model.encode(rng.standard_normal((8, 1), np.float32))
-    actions = rng.uniform(-1, 1, (3, 3, 1, 7)).astype(np.float32)
-    after = fac.h_step_return(model, z, actions, fac.PlannerConfig(horizon=2, value_at="after"))
-    last = fac.h_step_return(model, z, actions, fac.PlannerConfig(horizon=3, value_at="last"))
-    assert np.array_equal(after, last)
+    actions = rng.uniform(-1, 1, (3, 4, 1, 7)).astype(np.float32)
+
+    def returns(horizon, value_at):
+        config = fac.PlannerConfig(horizon=horizon, value_at=value_at)
+        return fac.h_step_return(model, z, actions, config)
+
+    assert np.array_equal(returns(2, "after"), returns(3, "last"))
+    for horizon in (1, 3):
+        mean = (returns(horizon, "after") + returns(horizon, "last")) / 2
+        assert np.allclose(returns(horizon, "both"), mean, rtol=1e-6)
 
 
-def test_turns_plan_with_equation_2_then_with_one_step_less():
+def test_turns_plan_with_the_mean_then_with_equation_2():
     """Alone, each form would find these actions from the same warm start and random streams."""
     model, obs = random_model(), np.ones(8, np.float32)
     configs = {value_at: fac.PlannerConfig(samples=16, iterations=2, horizon=2, value_at=value_at)
-               for value_at in ("after", "last", "turns")}
+               for value_at in ("both", "after", "turns")}
     planner, z = fac.AgentPlanner(model, configs["turns"]), model.encode(obs[:, None])
     planner.reset(np.random.SeedSequence(0).spawn(3))
-    for value_at in ["after"] * fac.TURN + ["last"] * fac.TURN + ["after"]:
+    for value_at in ["both"] * fac.TURN + ["after"] * fac.TURN + ["both"]:
         alone = fac.AgentPlanner(model, configs[value_at])
-        kept = alone.mean.shape[1]
-        alone.mean[:], alone.rngs = planner.mean[:, :kept], copy.deepcopy(planner.rngs)
+        alone.mean[:], alone.rngs = planner.mean, copy.deepcopy(planner.rngs)
         assert np.array_equal(planner.plan(z), alone.plan(z))
-        assert np.array_equal(planner.mean[:, :kept], alone.mean)
-        assert not planner.mean[:, kept:].any()
+        assert np.array_equal(planner.mean, alone.mean)
     for _ in range(fac.TURN):
         planner.plan(z)
-    planner.reset([])  # an episode starts with Equation 2
-    alone = fac.AgentPlanner(model, configs["after"])
+    planner.reset([])  # an episode starts with the mean
+    alone = fac.AgentPlanner(model, configs["both"])
     alone.rngs = copy.deepcopy(planner.rngs)
     assert np.array_equal(planner.plan(z), alone.plan(z))
 
