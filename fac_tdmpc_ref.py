@@ -2288,7 +2288,7 @@ def command_distill(args):
     subjects = ((expert, alike, 0), (student, alike, 0), (student, alike, beside), (expert, own, 0))
     with contextlib.ExitStack() as stack:
         turns = [[stack.enter_context(Planner(model, turn, workers=workers))
-                  for turn in settings.turns] for model, settings, workers in subjects]
+                  for turn in form.turns] for model, form, workers in subjects]
         timed, _ = take_turns([lambda planners=planners: [p.act(obs) for p in planners]
                                for planners in turns], 20, "timing")
     ms = [1e3 * float(s) / len(planners) for s, planners in zip(np.median(timed, 0), turns)]
