@@ -1652,6 +1652,12 @@ def episode_seeds(seed, episodes):
     return [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(seed).spawn(episodes)]
 
 
+def training_seeds(seed, stream, first, count):
+    """Seeds of the episodes first, first + 1, ... that a run learns from, apart for each stream."""
+    return [int(np.random.default_rng([seed, stream, i]).integers(2 ** 31))
+            for i in range(first, first + count)]
+
+
 def move_target(obs, reward, back, chosen, task):
     """Move the target of reacher segments back by `back` (B, 2) where chosen (B,), in place.
 
@@ -2124,13 +2130,10 @@ def train_student(distiller, out, settings, playing, workers):
 
 def own_episodes(distiller, task, playing, workers):
     """The next episodes that the student plays, as `Distiller.add` takes them [D9]."""
-    count, first = distiller.config.own_episodes, len(distiller.own)
-    seeds = [int(np.random.default_rng([distiller.seed, 3, first + i]).integers(2 ** 31))
-             for i in range(count)]
-    part = EPISODE_STEPS // 20
+    count, part = distiller.config.own_episodes, EPISODE_STEPS // 20
     with contextlib.closing(Actors(task, worker_count(workers, count) or 1)) as actors, \
             progress("the student plays", count * EPISODE_STEPS, "decision") as bar:
-        actors.begin(seeds, 0.0, {}, [])
+        actors.begin(training_seeds(distiller.seed, 3, len(distiller.own), count), 0.0, {}, [])
         for _ in range(0, EPISODE_STEPS, part):
             actors.play(part, distiller.student, playing)
             actors.wait()
@@ -2543,8 +2546,8 @@ class Training:
         # the random episodes' updates come before the first planned episode
         losses = self.learn_until(start, bar)
         tested = not warming and self.decisions % args.evaluate_every < quota
-        actors.begin([int(np.random.default_rng([args.seed, 2, first + i]).integers(2 ** 31))
-                      for i in range(args.envs)], std, *(self.tests() if tested else ({}, [])))
+        actors.begin(training_seeds(args.seed, 2, first, args.envs), std,
+                     *(self.tests() if tested else ({}, [])))
         for played in range(0, EPISODE_STEPS, args.refresh):
             end = min(played + args.refresh, EPISODE_STEPS)
             actors.play(end - played, *exploring)

@@ -255,7 +255,7 @@ def train(args, config, planner):
         learner.load(saved["learner"])
         decisions, seconds = saved["decisions"], saved["seconds"]
         elapsed = seconds
-        replay.load({**saved, "observation": saved["obs"]})
+        replay.load({"observation": saved.get("obs"), **saved})  # its name in older checkpoints
         rng.bit_generator.state = saved["rng"]
         torch.set_rng_state(saved["torch_rng"].cpu())
         if torch.cuda.is_available():
@@ -329,11 +329,8 @@ def train(args, config, planner):
                 writer.writerow([decisions, round(elapsed / 60, 2), round(std, 3), horizon,
                                  round(float(returns.mean()), 1), round(float(returns.min()), 1),
                                  round(float(returns.max()), 1), *(f"{t:.5g}" for t in terms)])
-            kept = len(replay)
             state = {"settings": settings, "learner": learner.state(), "decisions": decisions,
-                     "seconds": elapsed, "obs": replay.observation[:kept],
-                     "action": replay.action[:kept], "reward": replay.reward[:kept],
-                     "count": replay.count, "rng": rng.bit_generator.state,
+                     "seconds": elapsed, **replay.state(), "rng": rng.bit_generator.state,
                      "torch_rng": torch.get_rng_state(),
                      "cuda_rng": torch.cuda.get_rng_state_all()}
             with fac.atomic_file(checkpoint) as file:

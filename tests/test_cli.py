@@ -296,6 +296,7 @@ def test_distill_refuses(tmp_path, files, flags, parts):
     (["evaluate"], ["--model"]),
     (["benchmark", "--robots", "reecher"], ["'reecher'", *fac.ROBOTS]),
     (["benchmark", "--runs", "9"], ["runs", "at least 10"]),
+    (["benchmark", "--value-at", "auto"], ["value_at", "after, last or both"]),
     (["benchmark", "--value-at", "turns"], ["value_at", "after, last or both", "turns"]),
     (["benchmark", "--workers", "-1"], ["--workers", "-1"]),
     (["benchmark", "--elites", "600"], ["600 elites", "512 samples"]),

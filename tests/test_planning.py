@@ -98,14 +98,15 @@ def plans(model, value_at):
     """Successive actions for one observation."""
     config = fac.PlannerConfig(samples=16, iterations=2, horizon=2, value_at=value_at)
     planner = fac.Planner(model, config)
-    return np.stack([planner.act(np.ones(8)) for _ in range(fac.TURN + 1)])
+    return np.stack([planner.act(np.ones(8)) for _ in range(2 * fac.TURN)])
 
 
 def test_auto_is_equation_2_for_an_expert_and_turns_for_a_student():
     for model, expected in ((random_model(1, policy=True), "after"), (random_model(1), "turns"),
                             (random_model(3), "turns")):
-        found = {form: plans(model, form) for form in ("auto", "after", "both", "turns")}
+        found = {form: plans(model, form) for form in ("auto", "after", "last", "both", "turns")}
         assert np.array_equal(found.pop("auto"), found[expected])
+        assert len({plan.tobytes() for plan in found.values()}) == 4
         assert fac.PlannerConfig().settled(model).value_at == expected
     for value_at, reason in (("auto", "model"), ("turns", "decision")):
         with pytest.raises(fac.UserError, match=f"depends on the {reason}"):
