@@ -113,8 +113,8 @@ class PlannerConfig:
                          paper=3)
     value_at: str = field("auto", "where Q ends the return: after (Equation 2: H rewards, then Q "
                           "of action H + 1), last (authors' code: Q of action H, alone if H is 1), "
-                          "both (their mean), turns (both and after, 25 decisions each) or auto: "
-                          "after for experts, turns for students [D5]",
+                          "both (their mean), turns (both, both, after, last, 25 decisions each) "
+                          "or auto: after for experts, turns for students [D5]",
                           paper="after", choices=("auto", "after", "last", "both", "turns"))
     discount: float = field(0.99, "gamma (Table 2)")
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)")
@@ -164,10 +164,11 @@ class PlannerConfig:
 
     @property
     def turns(self):
-        """What plans in turn, TURN decisions each: this alone, or the two forms of "turns"."""
+        """What plans in turn, TURN decisions each: this alone, or the forms of "turns"."""
         if self.value_at != "turns":
             return (self,)
-        return tuple(dataclasses.replace(self, value_at=form) for form in ("both", "after"))
+        return tuple(dataclasses.replace(self, value_at=form)
+                     for form in ("both", "both", "after", "last"))
 
     def settled(self, model):
         """This, with "auto" replaced by what suits the model: only experts have a policy."""
@@ -1238,7 +1239,7 @@ def mppi(returns, mean, config, rngs, proposals=None):
     return mean[..., 0], elites, weights
 
 
-TURN = 25  # decisions that students plan with one return before the other [D5]
+TURN = 25  # decisions that students plan with one return before the next [D5]
 
 
 class AgentPlanner:
@@ -1251,7 +1252,7 @@ class AgentPlanner:
 
     def reset(self, seeds):
         """Forget the warm start; seeds: one SeedSequence for each agent, [] to keep streams."""
-        sizes, length = self.model.config, self.turns[0].rewards + 1
+        sizes, length = self.model.config, max(turn.rewards for turn in self.turns) + 1
         self.t, self.mean = 0, np.zeros((sizes.num_agents, length, sizes.agent_actions), F32)
         if len(seeds):
             self.rngs = [np.random.Generator(np.random.SFC64(s)) for s in seeds]
@@ -1259,12 +1260,12 @@ class AgentPlanner:
     def plan(self, z):
         """z (N, m, 1) -> the agents' first actions (N, d); keeps the warm start."""
         config = self.turns[self.t // TURN % len(self.turns)]
-        self.t += 1
+        self.t, length = self.t + 1, config.rewards + 1
         self.returns.start(z, config)
-        mean, elites, weights = mppi(self.returns, self.mean, config, self.rngs,
+        mean, elites, weights = mppi(self.returns, self.mean[:, :length], config, self.rngs,
                                      self._proposals(z, config))
-        self.mean[:, :-1] = mean[:, 1:]
-        self.mean[:, -1] = 0
+        self.mean[:] = 0
+        self.mean[:, :length - 1] = mean[:, 1:]
         if config.output == "mean":
             return mean[:, 0]
         pick = [min(np.searchsorted(np.cumsum(w), rng.random()), len(w) - 1)
@@ -2228,7 +2229,7 @@ def output_folder(path):
 
 def check_dynamics(config, planning):
     """UserError if a student would plan with dynamics that distillation leaves as they were."""
-    if config.terms == 1 and planning.turns[0].rewards:
+    if config.terms == 1 and any(turn.rewards for turn in planning.turns):
         raise UserError("horizon 1 without the final term distils no dynamics, which the student "
                         "plans with; raise the horizon, keep the term, or have distill plan with "
                         "--plan-value-at last")

@@ -98,7 +98,7 @@ def plans(model, value_at):
     """Successive actions for one observation."""
     config = fac.PlannerConfig(samples=16, iterations=2, horizon=2, value_at=value_at)
     planner = fac.Planner(model, config)
-    return np.stack([planner.act(np.ones(8)) for _ in range(2 * fac.TURN)])
+    return np.stack([planner.act(np.ones(8)) for _ in range(3 * fac.TURN)])
 
 
 def test_auto_is_equation_2_for_an_expert_and_turns_for_a_student():
@@ -129,18 +129,20 @@ def test_value_at():
         assert np.allclose(returns(horizon, "both"), mean, rtol=1e-6)
 
 
-def test_turns_plan_with_the_mean_then_with_equation_2():
+def test_turns_plan_with_the_mean_twice_then_with_each_of_its_two_returns():
     """Alone, each form would find these actions from the same warm start and random streams."""
     model, obs = random_model(), np.ones(8, np.float32)
     configs = {value_at: fac.PlannerConfig(samples=16, iterations=2, horizon=2, value_at=value_at)
-               for value_at in ("both", "after", "turns")}
+               for value_at in ("both", "after", "last", "turns")}
     planner, z = fac.AgentPlanner(model, configs["turns"]), model.encode(obs[:, None])
     planner.reset(np.random.SeedSequence(0).spawn(3))
-    for value_at in ["both"] * fac.TURN + ["after"] * fac.TURN + ["both"]:
+    for value_at in np.repeat(["both", "both", "after", "last", "both"], fac.TURN):
         alone = fac.AgentPlanner(model, configs[value_at])
-        alone.mean[:], alone.rngs = planner.mean, copy.deepcopy(planner.rngs)
+        length = alone.mean.shape[1]  # last: one action less
+        alone.mean[:], alone.rngs = planner.mean[:, :length], copy.deepcopy(planner.rngs)
         assert np.array_equal(planner.plan(z), alone.plan(z))
-        assert np.array_equal(planner.mean, alone.mean)
+        assert np.array_equal(planner.mean[:, :length], alone.mean)
+        assert not planner.mean[:, length:].any()
     for _ in range(fac.TURN):
         planner.plan(z)
     planner.reset([])  # an episode starts with the mean
