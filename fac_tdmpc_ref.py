@@ -35,6 +35,7 @@ from the paper are tagged [D1], [D2], ...; the README lists them with what each 
 from __future__ import annotations
 
 import argparse
+import collections
 import contextlib
 import csv
 import dataclasses
@@ -113,8 +114,8 @@ class PlannerConfig:
                          paper=3)
     value_at: str = field("auto", "where Q ends the return: after (Equation 2: H rewards, then Q "
                           "of action H + 1), last (authors' code: Q of action H, alone if H is 1), "
-                          "both (their mean), turns (both, both, after, last, 25 decisions each) "
-                          "or auto: after for experts, turns for students [D5]",
+                          "both (their mean), turns (both for 75 decisions, after for 25, both for "
+                          "75, last for 25) or auto: after for experts, turns for students [D5]",
                           paper="after", choices=("auto", "after", "last", "both", "turns"))
     discount: float = field(0.99, "gamma (Table 2)")
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)")
@@ -167,8 +168,9 @@ class PlannerConfig:
         """What plans in turn, TURN decisions each: this alone, or the forms of "turns"."""
         if self.value_at != "turns":
             return (self,)
-        return tuple(dataclasses.replace(self, value_at=form)
-                     for form in ("both", "both", "after", "last"))
+        both, after, last = (dataclasses.replace(self, value_at=form)
+                             for form in ("both", "after", "last"))
+        return both, both, both, after, both, both, both, last
 
     def settled(self, model):
         """This, with "auto" replaced by what suits the model: only experts have a policy."""
@@ -1239,7 +1241,7 @@ def mppi(returns, mean, config, rngs, proposals=None):
     return mean[..., 0], elites, weights
 
 
-TURN = 25  # decisions that students plan with one return before the next [D5]
+TURN = 25  # decisions that a student plans with one return before the next [D5]
 
 
 class AgentPlanner:
@@ -2290,12 +2292,14 @@ def command_distill(args):
                            "evaluating the expert")["returns"]
     obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
     subjects = ((expert, alike, 0), (student, alike, 0), (student, alike, beside), (expert, own, 0))
+    kinds = [collections.Counter(form.turns) for _, form, _ in subjects]
     with contextlib.ExitStack() as stack:
-        turns = [[stack.enter_context(Planner(model, turn, workers=workers))
-                  for turn in form.turns] for model, form, workers in subjects]
-        timed, _ = take_turns([lambda planners=planners: [p.act(obs) for p in planners]
-                               for planners in turns], 20, "timing")
-    ms = [1e3 * float(s) / len(planners) for s, planners in zip(np.median(timed, 0), turns)]
+        planners = [stack.enter_context(Planner(model, kind, workers=workers))
+                    for (model, _, workers), counts in zip(subjects, kinds) for kind in counts]
+        timed, _ = take_turns([functools.partial(p.act, obs) for p in planners], 20, "timing")
+    median = iter(np.median(timed, 0))
+    ms = [1e3 * float(sum(next(median) * n for n in counts.values())) / counts.total()
+          for counts in kinds]
     if not beside or (args.plan_workers is None and ms[2] >= ms[1]):
         beside, ms[2] = 0, ms[1]  # handing over costs more than it saves
 

@@ -98,7 +98,7 @@ def plans(model, value_at):
     """Successive actions for one observation."""
     config = fac.PlannerConfig(samples=16, iterations=2, horizon=2, value_at=value_at)
     planner = fac.Planner(model, config)
-    return np.stack([planner.act(np.ones(8)) for _ in range(3 * fac.TURN)])
+    return np.stack([planner.act(np.ones(8)) for _ in range(4 * fac.TURN)])
 
 
 def test_auto_is_equation_2_for_an_expert_and_turns_for_a_student():
@@ -129,14 +129,15 @@ def test_value_at():
         assert np.allclose(returns(horizon, "both"), mean, rtol=1e-6)
 
 
-def test_turns_plan_with_the_mean_twice_then_with_each_of_its_two_returns():
+def test_turns_plan_with_the_mean_and_now_and_then_with_one_of_its_two_returns():
     """Alone, each form would find these actions from the same warm start and random streams."""
     model, obs = random_model(), np.ones(8, np.float32)
     configs = {value_at: fac.PlannerConfig(samples=16, iterations=2, horizon=2, value_at=value_at)
                for value_at in ("both", "after", "last", "turns")}
     planner, z = fac.AgentPlanner(model, configs["turns"]), model.encode(obs[:, None])
     planner.reset(np.random.SeedSequence(0).spawn(3))
-    for value_at in np.repeat(["both", "both", "after", "last", "both"], fac.TURN):
+    cycle = 3 * ["both"] + ["after"] + 3 * ["both"] + ["last"]
+    for value_at in np.repeat(cycle + cycle[:3], fac.TURN):
         alone = fac.AgentPlanner(model, configs[value_at])
         length = alone.mean.shape[1]  # last: one action less
         alone.mean[:], alone.rngs = planner.mean[:, :length], copy.deepcopy(planner.rngs)
