@@ -129,16 +129,20 @@ class PlannerConfig:
         if self.elites == 0:
             object.__setattr__(self, "elites", max(1, self.samples // 8))
         for name, least in (("samples", 1), ("iterations", 1), ("elites", 1), ("horizon", 1),
-                            ("pi_trajs", 0), ("temperature", 0), ("discount", 0), ("momentum", 0)):
-            if not getattr(self, name) >= least:  # nan is not, either
-                raise UserError(f"planner: {name} must be at least {least}, not "
+                            ("pi_trajs", 0), ("temperature", 0)):
+            if not least <= getattr(self, name) < np.inf:  # nan is not, either
+                raise UserError(f"planner: {name} must be at least {least} and finite, not "
+                                f"{getattr(self, name)}")
+        for name in ("discount", "momentum"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise UserError(f"planner: {name} must lie between 0 and 1, not "
                                 f"{getattr(self, name)}")
         if self.elites > self.samples:
             raise UserError(f"planner: {self.elites} elites can't be chosen from {self.samples} "
                             f"samples; lower elites or raise samples")
-        if not 0 < self.min_std <= self.max_std:
-            raise UserError(f"planner: needs 0 < min_std <= max_std, not {self.min_std}, "
-                            f"{self.max_std}")
+        if not 0 < self.min_std <= self.max_std < np.inf:
+            raise UserError(f"planner: needs 0 < min_std <= max_std, both finite, not "
+                            f"{self.min_std}, {self.max_std}")
         check_choices(self)
 
     @property
@@ -212,8 +216,9 @@ class DistillConfig:
                        choices=("table2", "section51"))
     new_targets: float = field(0.5, "reacher only: share of states whose target is drawn anew, as "
                                "the task draws it [D7]", paper=0.0)
-    own_episodes: int = field(16, "episodes that the student plays after each quarter of the "
-                              "steps; their states join the replay's [D9]", paper=0)
+    own_episodes: int = field(16, "episodes that the student plays after each of the first three "
+                              "quarters of the steps; their states join the replay's [D9]",
+                              paper=0)
     own_share: float = field(0.25, "share of states from the student's own episodes [D9]",
                              paper=0.0)
     held_out: float = field(0.05, "share of episodes kept for the rank correlation")
@@ -222,22 +227,24 @@ class DistillConfig:
         for name, least in (("steps", 1), ("batch_size", 1), ("horizon", 1), ("noise_samples", 2),
                             ("lam", 0), ("reward_coef", 0), ("value_coef", 0), ("warmup", 0),
                             ("own_episodes", 0)):
-            if not getattr(self, name) >= least:
-                raise UserError(f"distillation: {name} must be at least {least}, not "
+            if not least <= getattr(self, name) < np.inf:
+                raise UserError(f"distillation: {name} must be at least {least} and finite, not "
                                 f"{getattr(self, name)}")
         for name in ("noise_std_min", "temperature_student", "temperature_expert", "lr",
                      "grad_clip"):
-            if not getattr(self, name) > 0:
-                raise UserError(f"distillation: {name} must be above 0, not {getattr(self, name)}")
-        if not self.noise_std >= self.noise_std_min:
+            if not 0 < getattr(self, name) < np.inf:
+                raise UserError(f"distillation: {name} must be above 0 and finite, not "
+                                f"{getattr(self, name)}")
+        if not self.noise_std_min <= self.noise_std < np.inf:
             raise UserError(f"distillation: noise_std must be at least noise_std_min "
-                            f"({self.noise_std_min}), not {self.noise_std}")
+                            f"({self.noise_std_min}) and finite, not {self.noise_std}")
         for name in ("new_targets", "own_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise UserError(f"distillation: {name} is a share, not {getattr(self, name)}")
         if self.terms > EPISODE_STEPS:
-            raise UserError(f"distillation: horizon must be below an episode's {EPISODE_STEPS}, "
-                            f"not {self.horizon}")
+            raise UserError(f"distillation: horizon must be "
+                            f"{'below' if self.final_term else 'at most'} an episode's "
+                            f"{EPISODE_STEPS}, not {self.horizon}")
         if not 0 < self.held_out <= 0.5:
             raise UserError(f"distillation: held_out must lie between 0 and 0.5, not "
                             f"{self.held_out}")
@@ -287,9 +294,9 @@ class ExpertConfig:
         if self.horizon > EPISODE_STEPS:
             raise UserError(f"training: horizon must be at most an episode's {EPISODE_STEPS}, not "
                             f"{self.horizon}")
-        if not (self.lr > 0 and self.grad_clip > 0):
-            raise UserError(f"training: lr and grad_clip must be above 0, not {self.lr} and "
-                            f"{self.grad_clip}")
+        if not (0 < self.lr < np.inf and 0 < self.grad_clip < np.inf):
+            raise UserError(f"training: lr and grad_clip must be above 0 and finite, not {self.lr} "
+                            f"and {self.grad_clip}")
         check_choices(self)
 
 
@@ -756,8 +763,10 @@ def td_targets(model, target, obs, reward, noise, discount, empty=np.empty):
 def equation_1(model, obs, actions, reward, latents, td, config, grads=None, empty=np.empty):
     """Equation 1 and, into the dict `grads`, its gradients.
 
-        1/H sum_h lambda^h [c_T |s_{h+1} - latents_h|^2 + c_R (r_h - reward_h)^2
-                            + c_Q ((Q1_h - td_h)^2 + (Q2_h - td_h)^2)],  means over B and m
+        1/H sum_{h=0}^{H-1} lambda^h [c_T |s_{h+1} - latents_h|^2 + c_R (r_h - reward_h)^2
+                            + c_Q ((Q1_h - td_h)^2 + (Q2_h - td_h)^2)],  means over B and m,
+
+    as TD-MPC's code has it (the paper prints h = 0..H, no 1/H, and norms).
 
     obs (O, B): the first ones; actions (H, A, B); reward (H, B); latents and td from `td_targets`.
     Returns the loss, its three sums over h without coefficients, and the rollout s_0, ..., s_H
@@ -952,13 +961,14 @@ class Distiller:
                             f"{sizes.dim_action}); pass the replay of the expert's task")
         self.expert, self.config, self.seed = expert, config, seed
         agents = sizes.dim_action if num_agents is None else num_agents
-        self._threads = one_thread()  # until `close`, in this thread and the teacher's
-        self.optimizer, self.student = new_student(expert, agents, config, seed)
+        with one_thread():
+            self.optimizer, self.student = new_student(expert, agents, config, seed)
         self.replay, self.own = replay, ReplayBuffer(  # [D9]
             sizes.dim_obs, sizes.dim_action, 3 * config.own_episodes * EPISODE_STEPS, np.float16)
         self.own_count = round(config.own_share * config.batch_size) if config.own_episodes else 0
         self._teacher, self._next = ThreadPoolExecutor(1), None
         self._arenas = Arena(), Arena()  # the student's and the teacher's
+        self._threads = one_thread()  # until `close`, in this thread and the teacher's
 
     def batch(self, t):
         """Line 4 and the expert's part of step t: features, perturbed actions, targets."""
@@ -2090,6 +2100,13 @@ CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correla
          "rank_correlation_last")
 
 
+def check_finite(loss, update, lr):
+    """UserError if a loss is not finite: what would be saved is lost weights."""
+    if not np.isfinite(loss):
+        raise UserError(f"the loss of update {update} is {loss}: learning diverged; lower the "
+                        f"learning rate ({lr})")
+
+
 def train_student(distiller, out, settings, playing, workers):
     """Algorithm 1 to its end, with a learning curve and checkpoints in `out`.
 
@@ -2114,6 +2131,7 @@ def train_student(distiller, out, settings, playing, workers):
                 distiller.add(own_episodes(distiller, settings["task"], playing, workers))
             rate = learning_rate(config, distiller.t)
             losses.append(distiller.step())
+            check_finite(losses[-1][0], distiller.t, config.lr)
             bar.update()
             if distiller.t % every == 0 or distiller.t == config.steps:
                 loss, kl_reward, kl_value = np.mean(losses, 0)
@@ -2233,8 +2251,8 @@ def check_dynamics(config, planning):
     """UserError if a student would plan with dynamics that distillation leaves as they were."""
     if config.terms == 1 and any(turn.rewards for turn in planning.turns):
         raise UserError("horizon 1 without the final term distils no dynamics, which the student "
-                        "plans with; raise the horizon, keep the term, or have distill plan with "
-                        "--plan-value-at last")
+                        "plans with; raise the horizon, keep the term, or have it plan with "
+                        "--plan-value-at last --plan-horizon 1 (evaluate: without 'plan-')")
 
 
 def command_distill(args):
@@ -2300,6 +2318,7 @@ def command_distill(args):
     median = iter(np.median(timed, 0))
     ms = [1e3 * float(sum(next(median) * n for n in counts.values())) / counts.total()
           for counts in kinds]
+    ms[3] = ms[3] if own != alike else ms[0]
     if not beside or (args.plan_workers is None and ms[2] >= ms[1]):
         beside, ms[2] = 0, ms[1]  # handing over costs more than it saves
 
@@ -2525,6 +2544,7 @@ class Training:
         losses = []
         while self.updates < updates:
             losses.append(self.learn())
+            check_finite(np.sum(losses[-1]), self.updates, self.config.lr)
             bar.update()
         return losses
 
@@ -2550,7 +2570,8 @@ class Training:
         due = 0 if warming else int(config.updates_per_step * self.decisions)
         # the random episodes' updates come before the first planned episode
         losses = self.learn_until(start, bar)
-        tested = not warming and self.decisions % args.evaluate_every < quota
+        tested = (self.curve and not warming
+                  and self.decisions % args.evaluate_every < quota)
         actors.begin(training_seeds(args.seed, 2, first, args.envs), std,
                      *(self.tests() if tested else ({}, [])))
         for played in range(0, EPISODE_STEPS, args.refresh):
@@ -2758,6 +2779,9 @@ def command_evaluate(args):
     if args.record and task != header.get("task"):
         raise UserError(f"{args.model}: header: task: expected {task!r} to record its returns, "
                         f"found {header.get('task')!r}")
+    if "distill" in header:
+        check_dynamics(from_dict(DistillConfig, header["distill"], args.model),
+                       planning.settled(model))
     found = evaluate(model, task, planning, args.episodes, args.seed, args.workers)
     returns = found["returns"]
     result = {"return_mean": float(np.mean(returns)), "return_std": float(np.std(returns)),
@@ -3006,6 +3030,8 @@ def add_config(parser, config_class, title=None, prefix="", skip=(), **defaults)
         if f.name in skip:
             continue
         default, paper = defaults.get(f.name, f.default), f.metadata["paper"]
+        if paper is None and default != f.default:
+            paper = f.default
         shown = f"{default}" if paper is None else f"{default}; paper: {paper}"
         kind = {"action": argparse.BooleanOptionalAction}
         if not isinstance(default, bool):

@@ -140,6 +140,8 @@ except SystemExit as end:
     (("benchmark",), ["--robots", "humanoid", "--figure", "--iterations", "[3; paper: 3]"]),
     (("distill",), ["--task", "--preset", "--num-agents", "--evaluate-expert", "--plan-samples",
                     "[20000; paper: 100000]", "[forward; paper: reverse]", "reacher-hard"]),
+    (("train",), ["--student", "--plan-samples", "(Table 2) [128; paper: 512]",
+                  "(Table 2) [256; paper: 512]"]),
     (("evaluate",), ["--model", "--record", "--samples", "--output", "[6]"])])
 def test_help_is_quick_and_starts_nothing(tmp_path, command, expected):
     done = succeeded(launch(["-c", WATCHED, *command, "--help"], tmp_path))
@@ -257,11 +259,17 @@ def refused(done, *parts):
     (["--batch-size", "0"], ["batch_size", "at least 1"]),
     (["--horizon", "0"], ["horizon", "at least 1"]),
     (["--horizon", "500"], ["horizon", "below an episode's 500"]),
+    (["--horizon", "501", "--no-final-term"], ["horizon", "at most an episode's 500"]),
     (["--no-final-term"], ["no dynamics", "--plan-value-at last"]),
+    (["--no-final-term", "--plan-value-at", "last", "--plan-horizon", "2"],
+     ["no dynamics", "--plan-horizon 1"]),
     (["--own-episodes", "100000000", "--own-share", "1"], ["llocate"]),
     (["--noise-samples", "1"], ["noise_samples", "at least 2"]),
     (["--noise-std", "nan"], ["noise_std", "nan"]),
+    (["--noise-std", "inf"], ["noise_std", "finite"]),
     (["--lr", "0"], ["lr", "above 0"]),
+    (["--lr", "inf"], ["lr", "finite"]),
+    (["--lam", "inf"], ["lam", "finite"]),
     (["--held-out", "1"], ["held_out", "between 0 and 0.5"]),
     (["--held-out", "0.05"], ["replay.npz", "6 episodes are too few"]),
     (["--kl", "sideways"], ["--kl", "'sideways'", "forward"]),
@@ -271,6 +279,10 @@ def refused(done, *parts):
     (["--plan-samples", "0"], ["samples", "at least 1"]),
     (["--plan-pi-trajs", "-1"], ["pi_trajs", "-1"]),
     (["--plan-min-std", "3"], ["min_std", "max_std"]),
+    (["--plan-max-std", "inf"], ["max_std", "finite"]),
+    (["--plan-temperature", "inf"], ["temperature", "finite"]),
+    (["--plan-discount", "1.1"], ["discount", "between 0 and 1"]),
+    (["--plan-momentum", "5"], ["momentum", "between 0 and 1"]),
     (["--episodes", "0"], ["episodes", "at least 1"]),
     (["--workers", "-1"], ["--workers", "-1"]),
     (["--plan-workers", "3"], ["3 workers", "0 to 2"]),
@@ -288,6 +300,14 @@ def refused(done, *parts):
 def test_distill_refuses(tmp_path, files, flags, parts):
     flags = [flag.format(files=files) for flag in flags]
     refused(run(*distill_arguments(files, *flags), cwd=tmp_path), *parts)
+
+
+def test_what_diverges_is_refused_and_leaves_no_weights(tmp_path, files):
+    done = run(*distill_arguments(files, "--lr", "1e38", "--warmup", "0", "--steps", "20",
+                                  "--out", "run"), cwd=tmp_path)
+    assert done.returncode == 2 and done.stdout == "" and "Traceback" not in done.stderr
+    assert "diverged; lower the learning rate (1e+38)" in done.stderr.splitlines()[-1]
+    assert not list((tmp_path / "run").glob("*.npz"))
 
 
 @pytest.mark.parametrize("arguments, parts", [
@@ -631,6 +651,22 @@ def test_recorded_returns_stand_for_the_expert_in_distill(tmp_path, files, no_pl
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert result["expert_recorded"] is False and result["expert_returns"] == [123.0]
     assert labels == ["evaluating the student", "evaluating the expert"]
+
+
+def test_a_student_without_dynamics_plans_without_them(tmp_path, files, monkeypatch, capsys):
+    monkeypatch.setattr(fac, "evaluate", lambda *_: {"returns": [1.0], "plan_ms_median": 1.0})
+    monkeypatch.setattr(fac, "draw_curve", lambda *_: True)
+    arguments = distill_arguments(files, "--no-final-term", "--plan-value-at", "last", "--json",
+                                  "--out", tmp_path)
+    assert fac.main([str(a) for a in arguments]) == 0
+    table, result = capsys.readouterr().out.strip().rsplit("\n", 1)
+    result = json.loads(result)
+    assert result["plan_ms_expert_own"] == result["plan_ms_expert"]  # the same planning, one figure
+    assert "planning like its student" not in table
+    evaluate = ["evaluate", "--model", str(tmp_path / "student.npz")]
+    assert fac.main([*evaluate, "--value-at", "last"]) == 0
+    assert fac.main(evaluate) == 2
+    assert "no dynamics" in capsys.readouterr().err.splitlines()[-1]
 
 
 @pytest.mark.parametrize("config, seeds, expected", [

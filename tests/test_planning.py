@@ -129,11 +129,14 @@ def test_value_at():
         assert np.allclose(returns(horizon, "both"), mean, rtol=1e-6)
 
 
-def test_turns_plan_with_the_mean_and_now_and_then_with_one_of_its_two_returns():
+@pytest.mark.parametrize("horizon", [1, 2])
+def test_turns_plan_with_the_mean_and_now_and_then_with_one_of_its_two_returns(horizon):
     """Alone, each form would find these actions from the same warm start and random streams."""
     model, obs = random_model(), np.ones(8, np.float32)
-    configs = {value_at: fac.PlannerConfig(samples=16, iterations=2, horizon=2, value_at=value_at)
+    configs = {value_at: fac.PlannerConfig(samples=16, iterations=2, horizon=horizon,
+                                           value_at=value_at)
                for value_at in ("both", "after", "last", "turns")}
+    assert fac.TURN == 25  # as --help and the README's [D5] say
     planner, z = fac.AgentPlanner(model, configs["turns"]), model.encode(obs[:, None])
     planner.reset(np.random.SeedSequence(0).spawn(3))
     cycle = 3 * ["both"] + ["after"] + 3 * ["both"] + ["last"]
@@ -143,10 +146,7 @@ def test_turns_plan_with_the_mean_and_now_and_then_with_one_of_its_two_returns()
         alone.mean[:], alone.rngs = planner.mean[:, :length], copy.deepcopy(planner.rngs)
         assert np.array_equal(planner.plan(z), alone.plan(z))
         assert np.array_equal(planner.mean[:, :length], alone.mean)
-        assert not planner.mean[:, length:].any()
-    for _ in range(fac.TURN):
-        planner.plan(z)
-    planner.reset([])  # an episode starts with the mean
+    planner.reset([])  # an episode starts with the mean; "after" is next here
     alone = fac.AgentPlanner(model, configs["both"])
     alone.rngs = copy.deepcopy(planner.rngs)
     assert np.array_equal(planner.plan(z), alone.plan(z))
@@ -215,7 +215,9 @@ def test_an_observation_of_the_wrong_size_is_refused():
 
 def test_planner_config_refuses_nonsense():
     for wrong, text in (({"elites": 9, "samples": 8}, "elites"), ({"horizon": 0}, "horizon"),
-                        ({"min_std": 3.0}, "min_std"), ({"output": "best"}, "output")):
+                        ({"min_std": 3.0}, "min_std"), ({"output": "best"}, "output"),
+                        ({"temperature": np.inf}, "finite"), ({"max_std": np.inf}, "finite"),
+                        ({"discount": 1.1}, "between 0 and 1"), ({"momentum": np.nan}, "momentum")):
         with pytest.raises(fac.UserError, match=text):
             fac.PlannerConfig(**wrong)
     assert fac.PlannerConfig().elites == 64
@@ -231,7 +233,7 @@ def shared_memory():
 def test_workers_plan_the_same_bit_for_bit(n, d, workers):
     model = random_model(n, n * d, hidden=50)
     config = fac.PlannerConfig(samples=200, iterations=3, horizon=3)
-    obs = np.random.default_rng(4).standard_normal((4, 8))
+    obs = np.random.default_rng(4).standard_normal((3 * fac.TURN + 2, 8))  # two returns' turns
     before = shared_memory()
     with fac.Planner(model, config, seed=1) as alone, \
             fac.Planner(model, config, seed=1, workers=workers) as parallel:

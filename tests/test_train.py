@@ -64,12 +64,12 @@ def test_segments_are_in_order_and_most_get_other_targets():
     assert (hindsight | fresh)[moved].all()
 
 
-def play(parts, seed=4):
+def play(parts, seed=4, policy=True):
     """Actions of a training episode, from the first model and then, part by part, another."""
     episode = fac.Exploration(fac.Environment("reacher-easy"), seed, 0.1)
     sizes = fac.ModelConfig(8, 3, 1, 4, 6, 6)
     for model_seed, decisions in parts:
-        model = fac.WorldModel.create(sizes, np.random.default_rng(model_seed), policy=True)
+        model = fac.WorldModel.create(sizes, np.random.default_rng(model_seed), policy=policy)
         for key in ("_Q1.5.weight", "_Q2.5.weight"):  # zero at birth: all plans alike
             model.params[key] += 1
         episode.play(fac.Planner(model, fac.PlannerConfig(samples=16, iterations=2)), decisions)
@@ -81,6 +81,12 @@ def test_an_episode_may_get_new_weights_on_its_way():
     assert np.array_equal(play([(0, 5), (0, 7)]), whole)  # warm start and random streams go on
     newer = play([(0, 5), (1, 7)])
     assert np.array_equal(newer[:5], whole[:5]) and not np.allclose(newer[5:], whole[5:])
+
+
+def test_parts_of_an_episode_don_t_begin_the_turns_anew():
+    end = 3 * fac.TURN + 2  # past the first turn of another return
+    parts = [(0, fac.TURN)] * 3 + [(0, 2)]
+    assert np.array_equal(play(parts, policy=False), play([(0, end)], policy=False))
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +132,12 @@ def test_the_number_of_workers_changes_nothing(trained, tmp_path):
         assert weights(tmp_path / "other", kind) == weights(trained[1], kind)
 
 
+def test_a_run_may_begin_without_random_episodes(tmp_path):
+    done = run("train", *TINY, "--seed-decisions", "0", "--steps", "1000", "--out", "run", "--json",
+               cwd=tmp_path)
+    assert last_json(done)["steps"] == 1000
+
+
 def test_a_killed_run_goes_on_to_the_same_result(trained, tmp_path):
     out = tmp_path / "killed"
     stopped = run("train", *TINY, "--minutes", "1e-9", "--out", out, "--json", cwd=tmp_path)
@@ -156,6 +168,7 @@ def test_a_killed_run_goes_on_to_the_same_result(trained, tmp_path):
     (["--envs", "0"], ["envs", "at least 1"]),
     (["--workers", "0"], ["workers", "at least 1"]),
     (["--lr", "0"], ["lr", "above 0"]),
+    (["--lr", "inf"], ["lr", "finite"]),
     (["--updates-per-step", "nan"], ["updates_per_step", "nan"]),
     (["--mlp-dim", "0"], ["mlp_dim", "at least 1"]),
     (["--distill-horizon", "3"], ["4 steps", "hold 3"]),
