@@ -2492,7 +2492,7 @@ class OnlineStudent:
 
 
 # for a few cores; hidden layers of 512, as in Table 2, make an update three times as dear
-TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}
+TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
 FOLLOWING_DEFAULTS = {"noise_samples": 3}
 TRAINING_BUDGET = {"samples": 128, "iterations": 4, "horizon": 3, "value_at": "after"}
 TRAINING_CURVE = ("decisions", "updates", "seconds", "std", "horizon", "return_mean", "return_min",
@@ -3090,7 +3090,8 @@ def make_parser():
     sub.add_argument("--seed", type=natural, default=0, help="of distillation [0]")
     sub.add_argument("--num-agents", type=int, help="N, a divisor of dim(A) [dim(A)]")
     sub.add_argument("--preset", choices=("default", "paper"), default="default",
-                     help="paper: Algorithm 1 with Table 2 to the letter (days on a laptop)")
+                     help="paper: the paper's value of every setting that names one below (days on "
+                     "a laptop)")
     sub.add_argument("--expert", help="expert file, or a folder with expert.npz and replay.npz "
                      "[data/TASK]")
     sub.add_argument("--replay", help="replay file [data/TASK/replay.npz]")
@@ -3120,7 +3121,7 @@ def make_parser():
     sub.add_argument("--num-agents", type=int, help="the student's N [dim(A)]")
     sub.add_argument("--envs", type=natural, default=4, help="episodes in a round [4]")
     sub.add_argument("--refresh", type=natural, default=25, help="decisions that an episode goes "
-                     "on with the same weights [25]")
+                     "on with the same weights [D6] [25]")
     sub.add_argument("--workers", type=natural, default=max(1, (os.cpu_count() or 1) - 1),
                      help="processes that play them while this one learns [cores - 1]")
     sub.add_argument("--minutes", type=float, default=0, help="stop after the round under way by "
