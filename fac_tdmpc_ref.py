@@ -169,7 +169,11 @@ class PlannerConfig:
 
     @property
     def turns(self):
-        """What plans in turn, TURN decisions each: this alone, or the forms of "turns"."""
+        """What plans in turn, TURN decisions each: this alone, or the forms of "turns".
+
+        Where one of them is wrong it undoes what the others did, so the one that is wrong least
+        often plans most of the time [D5].
+        """
         if self.value_at != "turns":
             return (self,)
         both, after, last = (dataclasses.replace(self, value_at=form)
@@ -2101,7 +2105,7 @@ CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correla
 
 
 def check_finite(loss, update, lr):
-    """UserError if a loss is not finite: what would be saved is lost weights."""
+    """UserError if learning diverged, before its weights are saved."""
     if not np.isfinite(loss):
         raise UserError(f"the loss of update {update} is {loss}: learning diverged; lower the "
                         f"learning rate ({lr})")
@@ -2570,8 +2574,7 @@ class Training:
         due = 0 if warming else int(config.updates_per_step * self.decisions)
         # the random episodes' updates come before the first planned episode
         losses = self.learn_until(start, bar)
-        tested = (self.curve and not warming
-                  and self.decisions % args.evaluate_every < quota)
+        tested = self.curve and not warming and self.decisions % args.evaluate_every < quota
         actors.begin(training_seeds(args.seed, 2, first, args.envs), std,
                      *(self.tests() if tested else ({}, [])))
         for played in range(0, EPISODE_STEPS, args.refresh):
