@@ -72,8 +72,9 @@ def own_episode(observation):
 
 def go_on(distiller, steps):
     distiller._teacher = fac.ThreadPoolExecutor(1)
-    for _ in range(steps):
-        distiller.step()
+    with fac.one_thread():  # it was closed before
+        for _ in range(steps):
+            distiller.step()
     distiller.close()
 
 
