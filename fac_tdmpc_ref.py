@@ -2313,7 +2313,8 @@ def command_distill(args):
         returns = evaluate(expert, args.task, planning, args.episodes, args.eval_seed, args.workers,
                            "evaluating the expert")["returns"]
     obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
-    subjects = ((expert, alike, 0), (student, alike, 0), (student, alike, beside), (expert, own, 0))
+    subjects = ((expert, alike, 0), (student, alike, 0), (student, alike, beside),
+                *[(expert, own, 0)] * (own != alike))
     kinds = [collections.Counter(form.turns) for _, form, _ in subjects]
     with contextlib.ExitStack() as stack:
         planners = [stack.enter_context(Planner(model, kind, workers=workers))
@@ -2322,7 +2323,7 @@ def command_distill(args):
     median = iter(np.median(timed, 0))
     ms = [1e3 * float(sum(next(median) * n for n in counts.values())) / counts.total()
           for counts in kinds]
-    ms[3] = ms[3] if own != alike else ms[0]
+    ms += ms[:1] * (own == alike)  # the same planning, timed once
     if not beside or (args.plan_workers is None and ms[2] >= ms[1]):
         beside, ms[2] = 0, ms[1]  # handing over costs more than it saves
 

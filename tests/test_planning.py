@@ -146,6 +146,7 @@ def test_turns_plan_with_the_mean_and_now_and_then_with_one_of_its_two_returns(h
         alone.mean[:], alone.rngs = planner.mean[:, :length], copy.deepcopy(planner.rngs)
         assert np.array_equal(planner.plan(z), alone.plan(z))
         assert np.array_equal(planner.mean[:, :length], alone.mean)
+        assert not planner.mean[:, length:].any()
     planner.reset([])  # an episode starts with the mean; "after" is next here
     alone = fac.AgentPlanner(model, configs["both"])
     alone.rngs = copy.deepcopy(planner.rngs)
