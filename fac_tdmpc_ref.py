@@ -114,8 +114,8 @@ class PlannerConfig:
                          paper=3)
     value_at: str = field("auto", "where Q ends the return: after (Equation 2: H rewards, then Q "
                           "of action H + 1), last (authors' code: Q of action H, alone if H is 1), "
-                          "both (their mean), turns (both for 75 decisions, after for 25, both for "
-                          "75, last for 25) or auto: after for experts, turns for students [D5]",
+                          "both (their mean), turns (after for 50 decisions, both for 150, "
+                          "and again) or auto: after for experts, turns for students [D5]",
                           paper="after", choices=("auto", "after", "last", "both", "turns"))
     discount: float = field(0.99, "gamma (Table 2)")
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)")
@@ -171,14 +171,12 @@ class PlannerConfig:
     def turns(self):
         """What plans in turn, TURN decisions each: this alone, or the forms of "turns".
 
-        Where one of them is wrong it undoes what the others did, so the one that is wrong least
-        often plans most of the time [D5].
+        Equation 2 gets a walker off the ground, the mean holds an arm on its target [D5].
         """
         if self.value_at != "turns":
             return (self,)
-        both, after, last = (dataclasses.replace(self, value_at=form)
-                             for form in ("both", "after", "last"))
-        return both, both, both, after, both, both, both, last
+        after, both = (dataclasses.replace(self, value_at=form) for form in ("after", "both"))
+        return after, both, both, both
 
     def settled(self, model):
         """This, with "auto" replaced by what suits the model: only experts have a policy."""
@@ -1255,7 +1253,7 @@ def mppi(returns, mean, config, rngs, proposals=None):
     return mean[..., 0], elites, weights
 
 
-TURN = 25  # decisions that a student plans with one return before the next [D5]
+TURN = 50  # decisions that a student plans with one return before the next [D5]
 
 
 class AgentPlanner:
@@ -1268,7 +1266,7 @@ class AgentPlanner:
 
     def reset(self, seeds):
         """Forget the warm start; seeds: one SeedSequence for each agent, [] to keep streams."""
-        sizes, length = self.model.config, max(turn.rewards for turn in self.turns) + 1
+        sizes, length = self.model.config, self.turns[0].rewards + 1  # all alike
         self.t, self.mean = 0, np.zeros((sizes.num_agents, length, sizes.agent_actions), F32)
         if len(seeds):
             self.rngs = [np.random.Generator(np.random.SFC64(s)) for s in seeds]
@@ -1276,12 +1274,11 @@ class AgentPlanner:
     def plan(self, z):
         """z (N, m, 1) -> the agents' first actions (N, d); keeps the warm start."""
         config = self.turns[self.t // TURN % len(self.turns)]
-        self.t, length = self.t + 1, config.rewards + 1
+        self.t += 1
         self.returns.start(z, config)
-        mean, elites, weights = mppi(self.returns, self.mean[:, :length], config, self.rngs,
+        mean, elites, weights = mppi(self.returns, self.mean, config, self.rngs,
                                      self._proposals(z, config))
-        self.mean[:] = 0
-        self.mean[:, :length - 1] = mean[:, 1:]
+        self.mean[:, :-1], self.mean[:, -1] = mean[:, 1:], 0
         if config.output == "mean":
             return mean[:, 0]
         pick = [min(np.searchsorted(np.cumsum(w), rng.random()), len(w) - 1)
