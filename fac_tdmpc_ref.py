@@ -171,7 +171,7 @@ class PlannerConfig:
     def turns(self):
         """What plans in turn, TURN decisions each: this alone, or the forms of "turns".
 
-        Equation 2 gets a walker off the ground, the mean holds an arm on its target [D5].
+        Equation 2 gets a walker off the ground, the mean mostly holds an arm on its target [D5].
         """
         if self.value_at != "turns":
             return (self,)
