@@ -117,7 +117,7 @@ class PlannerConfig:
                           "both (their mean), turns (after for 50 decisions, both for 150, "
                           "and again) or auto: after for experts, turns for students [D5]",
                           paper="after", choices=("auto", "after", "last", "both", "turns"))
-    discount: float = field(0.99, "gamma (Table 2)")
+    discount: float = field(0.99, "gamma, where the model's file names no other (Table 2)")
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)")
     max_std: float = field(2.0, "first and largest sampling deviation (Table 2)")
     temperature: float = field(0.5, "an elite weighs exp(temperature * return) (Table 2)")
@@ -300,6 +300,12 @@ class ExpertConfig:
             raise UserError(f"training: lr and grad_clip must be above 0 and finite, not {self.lr} "
                             f"and {self.grad_clip}")
         check_choices(self)
+
+
+def stream(seed, use, index=0):
+    """The Generator of one use of a run's seed: no two uses, or indices of one, share numbers."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(
+        zlib.crc32(use.encode()), index)))
 
 
 def divisors(n):
@@ -746,7 +752,12 @@ def predict_backward(model, tapes, d_outputs, grads, empty=np.empty, d_latents=N
 # 4. TD-MPC's objective, Equation 1
 # ======================================================================================
 
-POLICY_NOISE = 0.3  # TD-MPC's policy noise is cut here
+POLICY_STD, POLICY_CUT = 0.05, 0.3  # TD-MPC's policy noise: its deviation, and where it is cut
+
+
+def policy_noise(shape, rng):
+    """What TD-MPC adds to its policy's actions, where it learns and where it proposes."""
+    return np.clip(rng.standard_normal(shape, F32) * F32(POLICY_STD), -POLICY_CUT, POLICY_CUT)
 
 
 def td_targets(model, target, obs, reward, noise, discount, empty=np.empty):
@@ -835,16 +846,15 @@ class Learner:
         self.slow_vector, slow = flatten(self.optimizer.params)
         self.target = WorldModel(sizes, slow)
 
-    def update(self, obs, actions, reward, std, rng):
+    def update(self, obs, actions, reward, rng):
         """One step of Equation 1, one of the policy; every `target_every` times the averages.
 
-        obs (H + 1, O, B), actions (H, A, B), reward (H, B), std of the policy's noise. Returns
-        the three terms of Equation 1 and the latents s_0, ..., s_H (1, m, (H + 1) * B).
+        obs (H + 1, O, B), actions (H, A, B), reward (H, B). Returns the three terms of Equation 1
+        and the latents s_0, ..., s_H (1, m, (H + 1) * B).
         """
         config, (steps, dim_action, batch) = self.config, actions.shape
         self._arena.rewind()
-        noise = rng.standard_normal((dim_action, 2 * steps + 1, batch), F32)
-        noise = np.clip(noise * F32(std), -POLICY_NOISE, POLICY_NOISE)
+        noise = policy_noise((dim_action, 2 * steps + 1, batch), rng)
         latents, td = td_targets(self.model, self.target, obs[1:], reward,
                                  noise[:, :steps].reshape(dim_action, -1), config.discount,
                                  self._arena.empty)
@@ -931,7 +941,7 @@ def new_student(expert, num_agents, config, seed):
     Where the student reads the expert's latent, it shares the expert's own encoder arrays [D3].
     """
     sizes = student_config(expert.config, num_agents, config.sizes, config.encoder_input)
-    student = WorldModel.create(sizes, np.random.default_rng([seed, 2 ** 32 - 1]))
+    student = WorldModel.create(sizes, stream(seed, "student"))
     frozen = {"_expert" + k: v for k, v in expert.params.items()
               if k.startswith("_encoder.") and config.encoder_input == "latent"}
     optimizer = Optimizer({k: v for k, v in student.params.items()
@@ -974,14 +984,14 @@ class Distiller:
 
     def batch(self, t):
         """Line 4 and the expert's part of step t: features, perturbed actions, targets."""
-        rng = np.random.default_rng([self.seed, t])
+        rng = stream(self.seed, "batch", t)
         starts = rng.choice(self.train_starts, self.config.batch_size)
         obs, actions = self.replay.sequences(starts, self.config.terms)
         if len(self.own):  # the first ones are the student's own [D9]
             own, actions[..., :self.own_count], _ = self.own.sample(
                 rng, self.own_count, self.config.terms, "")
             obs[:, :self.own_count] = own[0]
-        task = self.replay.header.get("task", "")
+        task = str(self.replay.header.get("task"))
         if task.startswith("reacher"):  # [D7]
             chosen = rng.random(len(starts)) < self.config.new_targets
             obs[3:5, chosen] = new_targets(obs[:, chosen], rng)
@@ -1051,13 +1061,15 @@ def rank_correlation(distiller, states, seed):
     actions as the expert does, which is what the loss asks for (section 4.4). Returns (L,).
     """
     from scipy.stats import rankdata
-    rng = np.random.default_rng(seed)
+    rng = stream(seed, "rank correlation")
     starts = rng.choice(distiller.held_out_starts, states)
     student, config = distiller.student, dataclasses.replace(distiller.config, noise_samples=32)
     sequences = distiller.replay.sequences(starts, distiller.config.terms)
     features, actions, (_, *q_expert) = perturbed_batch(distiller.expert, student, *sequences,
                                                         config, rng)
     _, *q_student = predict(student, student.encode_features(features), actions)
+    if not np.isfinite(q_student).all():
+        return np.full(len(actions), np.nan)
     ranks = [rankdata(q1 + q2, axis=-1) - 16.5 for q1, q2 in (q_expert, q_student)]
     norms = [np.linalg.norm(r, axis=-1) for r in ranks]
     return ((ranks[0] * ranks[1]).sum(-1) / np.maximum(norms[0] * norms[1], 1e-12)).mean(-1)
@@ -1240,6 +1252,10 @@ def mppi(returns, mean, config, rngs, proposals=None):
         if proposals is not None:
             actions = np.concatenate([actions, proposals], -1)
             G = np.concatenate([G, G_proposals], 1)
+        G = np.where(np.isfinite(G), G, F32(-np.inf))  # these weigh nothing
+        if np.isneginf(G.max(1)).any():
+            raise UserError("planning: no action sequence has a finite return; the model's weights "
+                            "or the observation are far out of range")
         best = np.argpartition(-G, config.elites - 1, axis=1)[:, :config.elites]
         elites = np.take_along_axis(actions, best[:, None, None], 3)
         weights = np.take_along_axis(G, best, 1)
@@ -1281,7 +1297,7 @@ class AgentPlanner:
         self.mean[:, :-1], self.mean[:, -1] = mean[:, 1:], 0
         if config.output == "mean":
             return mean[:, 0]
-        pick = [min(np.searchsorted(np.cumsum(w), rng.random()), len(w) - 1)
+        pick = [min(np.searchsorted(np.cumsum(w), rng.random(), "right"), len(w) - 1)
                 for w, rng in zip(weights, self.rngs)]
         return np.stack([e[0, :, i] for e, i in zip(elites, pick)])
 
@@ -1292,8 +1308,7 @@ class AgentPlanner:
         z, actions = np.repeat(z, config.pi_trajs, 2), []
         for h in range(config.rewards + 1):
             mu = self.model.policy(z)
-            noise = self.rngs[0].standard_normal(mu.shape, F32) * config.min_std
-            actions.append(np.clip(mu + np.clip(noise, -0.3, 0.3), -1, 1))
+            actions.append(np.clip(mu + policy_noise(mu.shape, self.rngs[0]), -1, 1))
             if h < config.rewards:
                 z = self.model.next(z, actions[-1])
         return np.stack(actions, 1)
@@ -1326,7 +1341,7 @@ class Planner:
                                     (*raw, sizes))
             for i, s in enumerate(self._shares[1:]):
                 self._workers.send(i, (model.agents(s.start, s.stop), config, s))
-        self.reset(seed)
+        self.reset(np.random.SeedSequence(seed).entropy)  # None: the system's own
 
     @staticmethod
     def _views(raw_z, raw_actions, sizes):
@@ -1398,9 +1413,16 @@ def shares(agents, workers):
     return [slice(i, j) for i, j in zip(cuts, cuts[1:])]
 
 
+def cores():
+    """Cores that this process may use, where the system tells (taskset, containers)."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def useful_workers(agents):
     """As many processes beside this one as there are cores and agents for."""
-    return min(agents, os.cpu_count() or 1) - 1
+    return min(agents, cores()) - 1
 
 
 def _planning_worker(connection, raw_z, raw_actions, sizes):
@@ -1443,6 +1465,8 @@ class Workers:
 
     def send(self, i, message):
         """Send to worker i."""
+        if self._members[i][1].closed:
+            raise WorkerError(f"{self._name} {i} was stopped before; start anew")
         try:  # plain pickle: the connection's own takes half of a hand-over
             self._members[i][1].send_bytes(pickle.dumps(message))
         except (BrokenPipeError, ConnectionResetError):
@@ -1666,10 +1690,9 @@ def episode_seeds(seed, episodes):
     return [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(seed).spawn(episodes)]
 
 
-def training_seeds(seed, stream, first, count):
-    """Seeds of the episodes first, first + 1, ... that a run learns from, apart for each stream."""
-    return [int(np.random.default_rng([seed, stream, i]).integers(2 ** 31))
-            for i in range(first, first + count)]
+def training_seeds(seed, use, first, count):
+    """Seeds of the episodes first, first + 1, ... that a run learns from, apart for each use."""
+    return [int(stream(seed, use, i).integers(2 ** 31)) for i in range(first, first + count)]
 
 
 def move_target(obs, reward, back, chosen, task):
@@ -1836,6 +1859,16 @@ def load_model(path):
         raise UserError(f"{path}: {next(iter(arrays))}: unknown entry; expected "
                         f"TD-MPC's state-dict names only")
     return WorldModel(config, params), header
+
+
+def trained_discount(header, where):
+    """gamma of a model's Q, or of its expert's: what it plans with; 0.99 if its file is silent."""
+    training = header.get("training") or {}
+    found = training.get("discount", 0.99) if isinstance(training, dict) else training
+    if not isinstance(found, (int, float)) or not 0 <= found <= 1:
+        raise UserError(f"{where}: header: training: discount: expected a number between 0 and 1, "
+                        f"found {found!r}")
+    return float(found)
 
 
 class Replay:
@@ -2024,15 +2057,18 @@ def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="eval
         raise UserError(f"episodes must be at least 1, not {episodes}")
     seeds = episode_seeds(seed, episodes)
     workers = worker_count(workers, episodes)
-    returns, seconds = np.zeros(episodes), np.zeros(episodes)
+    rewards, seconds, decided = (np.zeros((episodes, EPISODE_STEPS)), np.zeros(episodes),
+                                 [0] * episodes)
     with progress(label, episodes * EPISODE_STEPS, "decision") as bar:
         for i, part in _decisions(model, task, config, seeds, workers):
-            returns[i] += sum(reward for reward, _ in part)
+            rewards[i, decided[i]:decided[i] + len(part)] = [reward for reward, _ in part]
+            decided[i] += len(part)
             seconds[i] += sum(s for _, s in part)
             bar.update(len(part))
             if bar.n >= EPISODE_STEPS:
                 bar.set_postfix_str(f"mean return so far about "
-                                    f"{returns.sum() * EPISODE_STEPS / bar.n:.0f}", False)
+                                    f"{rewards.sum() * EPISODE_STEPS / bar.n:.0f}", False)
+    returns = rewards.sum(1)  # here, so that the parts' sizes don't matter
     return {"returns": [float(r) for r in returns], "seeds": seeds, "seed": seed,
             "planner": dataclasses.asdict(config.settled(model)),
             "plan_ms_median": 1e3 / EPISODE_STEPS * float(np.median(seconds))}
@@ -2040,7 +2076,7 @@ def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="eval
 
 def worker_count(workers, episodes):
     """As many processes as asked for, or as there are cores, but no more than episodes."""
-    return min(os.cpu_count() or 1 if workers is None else workers, episodes)
+    return min(cores() if workers is None else workers, episodes)
 
 
 def _decisions(model, task, config, seeds, workers):
@@ -2101,11 +2137,12 @@ CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correla
          "rank_correlation_last")
 
 
-def check_finite(loss, update, lr):
+def check_finite(values, update, lr):
     """UserError if learning diverged, before its weights are saved."""
-    if not np.isfinite(loss):
-        raise UserError(f"the loss of update {update} is {loss}: learning diverged; lower the "
-                        f"learning rate ({lr})")
+    for name, value in values.items():
+        if not np.isfinite(value).all():
+            raise UserError(f"after update {update} the {name} no longer finite: learning "
+                            f"diverged; lower the learning rate ({lr})")
 
 
 def train_student(distiller, out, settings, playing, workers):
@@ -2132,12 +2169,14 @@ def train_student(distiller, out, settings, playing, workers):
                 distiller.add(own_episodes(distiller, settings["task"], playing, workers))
             rate = learning_rate(config, distiller.t)
             losses.append(distiller.step())
-            check_finite(losses[-1][0], distiller.t, config.lr)
+            check_finite({"loss is": losses[-1]}, distiller.t, config.lr)
             bar.update()
             if distiller.t % every == 0 or distiller.t == config.steps:
                 loss, kl_reward, kl_value = np.mean(losses, 0)
                 losses, seconds = [], before + time.time() - began
                 rank = rank_correlation(distiller, 64, distiller.seed)
+                check_finite({"weights are": distiller.optimizer.vector,
+                              "student's predictions are": rank}, distiller.t, config.lr)
                 curve.append([distiller.t, round(seconds, 2), float(loss), float(kl_reward),
                               float(kl_value), rate, float(rank[0]), float(rank[-1])])
                 bar.set_postfix_str(f"loss {loss:.4f} KL reward {kl_reward:.4f} value "
@@ -2155,7 +2194,8 @@ def own_episodes(distiller, task, playing, workers):
     count, part = distiller.config.own_episodes, EPISODE_STEPS // 20
     with contextlib.closing(Actors(task, worker_count(workers, count) or 1)) as actors, \
             progress("the student plays", count * EPISODE_STEPS, "decision") as bar:
-        actors.begin(training_seeds(distiller.seed, 3, len(distiller.own), count), 0.0, {}, [])
+        actors.begin(training_seeds(distiller.seed, "own episode", len(distiller.own), count),
+                     0.0, {}, [])
         for _ in range(0, EPISODE_STEPS, part):
             actors.play(part, distiller.student, playing)
             actors.wait()
@@ -2259,7 +2299,9 @@ def check_dynamics(config, planning):
 def command_distill(args):
     """distill: expert and replay in, student, learning curve, table and JSON out."""
     began = time.time()
-    config, planning = args.configs
+    config, planning = (from_args(part, args, **(
+        paper_preset(part) if args.preset == "paper" else {})) for part in (DistillConfig,
+                                                                           PlannerConfig))
     lookup_task(args.task)
     if args.episodes < 1:
         raise UserError(f"episodes must be at least 1, not {args.episodes}")
@@ -2273,6 +2315,8 @@ def command_distill(args):
             raise UserError(f"{expert_path}: header: {key}: expected {expected!r}, found "
                             f"{header.get(key)!r}")
     check_task(expert.config, args.task)
+    if getattr(args, "PlannerConfig.discount") is None:
+        planning = dataclasses.replace(planning, discount=trained_discount(header, expert_path))
     Environment(args.task)  # what is missing is missed now, not after a quarter of the steps
     replay = Replay(args.replay or data_file(args.task, "replay.npz"))
     out = output_folder(args.out or f"runs/{args.task}-{args.seed}")
@@ -2286,7 +2330,8 @@ def command_distill(args):
                 "distill": dataclasses.asdict(config),
                 "own_planner": dataclasses.asdict(playing) if distiller.own_count else None,
                 "data": [checksum(expert.params.values()),
-                         checksum([replay.observation, replay.action])]}
+                         checksum([replay.observation, replay.action, replay.ends]),
+                         replay.header.get("task")]}
     print(f"{args.task}: {num_agents} agents of {distiller.student.config.latent_dim} latent "
           f"features, {len(distiller.optimizer.vector):,} weights; replay of "
           f"{replay.transitions:,} transitions; {config.steps:,} steps of {config.batch_size} x "
@@ -2295,7 +2340,8 @@ def command_distill(args):
         curve, seconds = train_student(distiller, out, settings, playing, args.workers)
         rank = rank_correlation(distiller, 256, args.seed)
     student = distiller.student
-    save_model(out / "student.npz", student, {"kind": "student", **settings})
+    save_model(out / "student.npz", student, {"kind": "student", **settings,
+                                              "training": header.get("training", {})})
     with atomic_file(out / "config.json", "w") as file:
         json.dump({**settings, "planner": dataclasses.asdict(planning)}, file, indent=1)
     drawn = draw_curve(out / "curve.png", curve, f"{args.task}, seed {args.seed}")
@@ -2385,7 +2431,7 @@ class Exploration:
 
     def __init__(self, environment, seed, std):
         self.environment, self.seed, self.std = environment, seed, std
-        self.rng, self.warm_start = np.random.default_rng([seed, 1]), None
+        self.rng, self.warm_start = stream(seed, "exploration"), None
         self.observation, self.action, self.reward = [environment.reset(seed)], [], []
 
     def play(self, planner, decisions):
@@ -2487,7 +2533,7 @@ class OnlineStudent:
         self._arena.rewind()
         batch = perturbed_batch(self.expert, self.model, obs,
                                 actions[:config.terms], config,
-                                np.random.default_rng([self.seed, t]), self._arena.empty)
+                                stream(self.seed, "perturbations", t), self._arena.empty)
         losses = distill_loss(self.model, *batch, config, self.optimizer.grads, self._arena.empty)
         self.optimizer.step(learning_rate(config, t), config.grad_clip)
         return losses
@@ -2515,7 +2561,7 @@ class Training:
         self.args, self.config, self.planning = args, config, planning
         sizes = ModelConfig(dim_obs, dim_action, 1, config.latent_dim, config.enc_dim,
                             config.mlp_dim)
-        self.learner = Learner(sizes, config, np.random.default_rng([args.seed, 0]))
+        self.learner = Learner(sizes, config, stream(args.seed, "expert"))
         self.student = distilling and OnlineStudent(self.learner.model, args.num_agents,
                                                     distilling, args.seed)
         self.buffer = ReplayBuffer(dim_obs, dim_action, config.buffer_size,
@@ -2534,10 +2580,10 @@ class Training:
 
     def learn(self):
         """One update of the expert and, on the same batch, one of the student."""
-        rng = np.random.default_rng([self.args.seed, 1, self.updates])
+        rng = stream(self.args.seed, "update", self.updates)
         obs, actions, reward = self.buffer.sample(rng, self.config.batch_size, self.config.horizon,
                                                   self.args.task)
-        terms, _ = self.learner.update(obs, actions, reward, self.std, rng)
+        terms, _ = self.learner.update(obs, actions, reward, rng)
         kl = self.student.update(obs[0], actions)[1:] if self.student else (0.0, 0.0)
         return *terms, *kl
 
@@ -2546,7 +2592,7 @@ class Training:
         losses = []
         while self.updates < updates:
             losses.append(self.learn())
-            check_finite(np.sum(losses[-1]), self.updates, self.config.lr)
+            check_finite({"losses are": losses[-1]}, self.updates, self.config.lr)
             bar.update()
         return losses
 
@@ -2568,12 +2614,11 @@ class Training:
         warming = self.decisions < config.seed_decisions
         exploring = () if warming else (self.learner.model, dataclasses.replace(
             self.planning, min_std=std, horizon=horizon))
-        start = 0 if warming else int(config.updates_per_step * (self.decisions - quota))
-        due = 0 if warming else int(config.updates_per_step * self.decisions)
-        # the random episodes' updates come before the first planned episode
-        losses = self.learn_until(start, bar)
+        start = self.updates
+        due = start if warming else int(config.updates_per_step * self.decisions)
+        losses = []
         tested = self.curve and not warming and self.decisions % args.evaluate_every < quota
-        actors.begin(training_seeds(args.seed, 2, first, args.envs), std,
+        actors.begin(training_seeds(args.seed, "training episode", first, args.envs), std,
                      *(self.tests() if tested else ({}, [])))
         for played in range(0, EPISODE_STEPS, args.refresh):
             end = min(played + args.refresh, EPISODE_STEPS)
@@ -2584,7 +2629,10 @@ class Training:
         for episode in episodes:
             self.buffer.add(*episode)
         self.decisions += quota
+        if warming and self.decisions >= config.seed_decisions:  # one round's behind, as later
+            losses = self.learn_until(int(config.updates_per_step * (self.decisions - quota)), bar)
         self.seconds += time.time() - began
+        self.check()
         tests, played = self.tested(returns), [float(reward.sum()) for *_, reward in episodes]
         self.curve.append([self.decisions, self.updates, round(self.seconds, 1), std, horizon,
                            float(np.mean(played)), min(played), max(played),
@@ -2617,11 +2665,17 @@ class Training:
         """The updates that are left, and an evaluation of what came out."""
         began = time.time()
         self.learn_until(updates, bar)
+        self.check()
         actors.begin([], 0.0, *self.tests())
         actors.play(EPISODE_STEPS)
         actors.wait()
         self.tested(actors.collect()[1])
         self.seconds += time.time() - began
+
+    def check(self):
+        """UserError if weights are not finite."""
+        for name, part in self.optimizers().items():
+            check_finite({f"weights ({name}) are": part.vector}, self.updates, self.config.lr)
 
     def optimizers(self):
         """Everything that is learned, by name."""
@@ -2665,7 +2719,9 @@ def lag(curve, fraction):
 
 def command_train(args):
     """train: an expert (Equation 1) and, with --student fac, a student that follows it (C.1)."""
-    config, planning, distilling = args.configs
+    config = from_args(ExpertConfig, args, **TRAINING_DEFAULTS)
+    planning = from_args(PlannerConfig, args, **TRAINING_BUDGET, discount=config.discount)
+    distilling = from_args(DistillConfig, args, **FOLLOWING_DEFAULTS)
     _, _, _, dim_action = lookup_task(args.task)
     quota = args.envs * EPISODE_STEPS
     for name in ("envs", "refresh", "workers", "evaluate_every", "evaluate_episodes"):
@@ -2729,7 +2785,8 @@ def command_train(args):
     for kind, model in models.items():
         header, prefix = {"kind": kind, **about}, "" if kind == "expert" else "student_"
         if args.episodes:
-            found = evaluate(model, args.task, PlannerConfig(), args.episodes, 0, None,
+            found = evaluate(model, args.task, PlannerConfig(discount=config.discount),
+                             args.episodes, 0, None,
                              f"evaluating the {kind}")
             returns = found["returns"]
             header["evaluation"] = evaluation_record(found)
@@ -2774,8 +2831,9 @@ def draw_training(path, curve, title):
 
 def command_evaluate(args):
     """evaluate: a model's returns on a task."""
-    (planning,) = args.configs
+    from_args(PlannerConfig, args)  # wrong settings first, then wrong files
     model, header = load_model(args.model)
+    planning = from_args(PlannerConfig, args, discount=trained_discount(header, args.model))
     task = args.task or header.get("task")
     if args.record and task != header.get("task"):
         raise UserError(f"{args.model}: header: task: expected {task!r} to record its returns, "
@@ -2947,7 +3005,7 @@ def speedups(prediction, decision, planning):
 
 def command_benchmark(args):
     """benchmark: Table 3 and whole decisions on this machine."""
-    (planning,) = args.configs
+    planning = from_args(PlannerConfig, args, **paper_preset(PlannerConfig))
     args.robots = list(dict.fromkeys(args.robots))
     for robot in args.robots:
         if robot not in ROBOTS:
@@ -2971,7 +3029,7 @@ def command_benchmark(args):
     result = {"prediction": prediction, "decision": decision,
               "speedup": speedups(prediction, decision, planning),
               "handover_us": float(np.median(hand_overs)) if hand_overs else None,
-              "cores": os.cpu_count() or 1}
+              "cores": cores()}
     print_benchmark(result, args.robots)
     if args.figure:
         draw_prediction(args.figure, prediction, args.robots)
@@ -3123,7 +3181,7 @@ def make_parser():
     sub.add_argument("--envs", type=natural, default=4, help="episodes in a round [4]")
     sub.add_argument("--refresh", type=natural, default=25, help="decisions that an episode goes "
                      "on with the same weights [D6] [25]")
-    sub.add_argument("--workers", type=natural, default=max(1, (os.cpu_count() or 1) - 1),
+    sub.add_argument("--workers", type=natural, default=max(1, cores() - 1),
                      help="processes that play them while this one learns [cores - 1]")
     sub.add_argument("--minutes", type=float, default=0, help="stop after the round under way by "
                      "then; 0: never [0]")
@@ -3135,7 +3193,8 @@ def make_parser():
                      "evaluations on the way [4000]")
     sub.add_argument("--evaluate-episodes", type=natural, default=10, help="episodes in one [10]")
     add_config(sub, ExpertConfig, **TRAINING_DEFAULTS)
-    add_config(sub, PlannerConfig, "MPPI while training", "plan-", **TRAINING_BUDGET)
+    add_config(sub, PlannerConfig, "MPPI while training", "plan-", skip=("discount",),
+               **TRAINING_BUDGET)
     add_config(sub, DistillConfig, "The student (Algorithm 1), on the expert's batches and steps",
                "distill-", skip=("steps", "batch_size", "new_targets", "own_episodes", "own_share",
                                 "held_out"),
@@ -3172,17 +3231,6 @@ def main(argv=None):
     """Run the command line; returns the exit status."""
     args = make_parser().parse_args(argv)
     try:
-        if args.command == "distill":
-            args.configs = tuple(
-                from_args(config, args, **(paper_preset(config) if args.preset == "paper" else {}))
-                for config in (DistillConfig, PlannerConfig))
-        elif args.command == "train":
-            args.configs = (from_args(ExpertConfig, args, **TRAINING_DEFAULTS),
-                            from_args(PlannerConfig, args, **TRAINING_BUDGET),
-                            from_args(DistillConfig, args, **FOLLOWING_DEFAULTS))
-        else:
-            paper = paper_preset(PlannerConfig) if args.command == "benchmark" else {}
-            args.configs = (from_args(PlannerConfig, args, **paper),)
         result = args.run(args)
     except (UserError, MemoryError) as error:
         print(f"fac_tdmpc_ref.py: error: {str(error) or 'not enough memory'}", file=sys.stderr)

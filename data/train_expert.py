@@ -13,10 +13,8 @@ round of episodes) when started again with the same --out. When all decisions ar
 writes expert.npz, replay.npz and golden.npz into data/<task>/, and data/golden-narrow.npz.
 """
 import argparse
-import csv
 import dataclasses
 import functools
-import os
 import sys
 import time
 from pathlib import Path
@@ -86,11 +84,11 @@ class TOLD(nn.Module):
         return self._Q1(x).squeeze(-1), self._Q2(x).squeeze(-1)
 
     def pi(self, z, std=0.0):
-        """Policy action with Gaussian noise cut to 0.3, as TD-MPC's TruncatedNormal."""
+        """Policy action with Gaussian noise, cut as in TD-MPC's TruncatedNormal."""
         mu = torch.tanh(self._pi(z))
         if std == 0:
             return mu
-        noise = (torch.randn_like(mu) * std).clamp(-0.3, 0.3)
+        noise = (torch.randn_like(mu) * std).clamp(-fac.POLICY_CUT, fac.POLICY_CUT)
         # the clamp to [-1, 1] passes gradients straight through
         a = mu + noise
         return a - a.detach() + a.detach().clamp(-1 + 1e-6, 1 - 1e-6)
@@ -149,7 +147,7 @@ class Learner:
         self.pi_optimizer.load_state_dict(state["pi_optimizer"])
         self.updates = state["updates"]
 
-    def update(self, obs, action, reward, pi_std):
+    def update(self, obs, action, reward, pi_std=fac.POLICY_STD):
         """One step of Equation 1, one of the policy, and every second time the targets."""
         config = self.config
         self.optimizer.zero_grad(set_to_none=True)
@@ -195,7 +193,7 @@ class Learner:
         pi_trajs, dim_action = planner.pi_trajs, mean.shape[-1]
         z, proposals = z0.repeat_interleave(pi_trajs, 0), []
         for h in range(length):
-            proposals.append(self.model.pi(z, min_std))
+            proposals.append(self.model.pi(z, fac.POLICY_STD))
             if h < length - 1:
                 z = self.model.next(z, proposals[-1])[0]
         proposals = torch.stack(proposals).view(length, num_env, pi_trajs, dim_action)
@@ -229,6 +227,10 @@ class Learner:
 
 # ------------------------------------------------------------------------------ training
 
+CURVE = ("decisions", "minutes", "std", "horizon", "return_mean", "return_min", "return_max",
+         "consistency", "reward", "value")
+
+
 def train(args, config, planner):
     """Train until args.decisions or args.minutes.
 
@@ -241,7 +243,7 @@ def train(args, config, planner):
     rng = np.random.default_rng(args.seed)
     learner = Learner(dim_obs, dim_action, config, args.device, args.precision)
     replay = fac.ReplayBuffer(dim_obs, dim_action, config.buffer_size, config.buffer_dtype)
-    decisions, seconds, elapsed, began = 0, 0.0, 0.0, time.time()
+    decisions, seconds, elapsed, curve, began = 0, 0.0, 0.0, [], time.time()
     out = Path(args.out)
     out.mkdir(parents=True, exist_ok=True)
     checkpoint = out / "checkpoint.pt"
@@ -253,9 +255,9 @@ def train(args, config, planner):
         saved = torch.load(checkpoint, weights_only=False, map_location=args.device)
         fac.same_settings({key: saved["settings"][key] for key in settings}, settings, checkpoint)
         learner.load(saved["learner"])
-        decisions, seconds = saved["decisions"], saved["seconds"]
+        decisions, seconds, curve = (saved[key] for key in ("decisions", "seconds", "curve"))
         elapsed = seconds
-        replay.load({"observation": saved.get("obs"), **saved})  # its name in older checkpoints
+        replay.load(saved)
         rng.bit_generator.state = saved["rng"]
         torch.set_rng_state(saved["torch_rng"].cpu())
         if torch.cuda.is_available():
@@ -264,11 +266,11 @@ def train(args, config, planner):
     def to_device(x):
         return torch.as_tensor(np.ascontiguousarray(x), device=args.device)
 
-    def learn(std):
+    def learn():
         """One update on a fresh batch; returns its three loss terms."""
         obs, action, reward = replay.sample(rng, config.batch_size, config.horizon, args.task)
         batch = map(to_device, (obs.swapaxes(1, 2), action.swapaxes(1, 2), reward))
-        return [x.detach() for x in learner.update(*batch, std)]
+        return [x.detach() for x in learner.update(*batch)]
 
     def out_of_time():
         return args.minutes and time.time() - began > 60 * args.minutes
@@ -299,7 +301,7 @@ def train(args, config, planner):
                     history.append(item)
                 quota = config.updates_per_step * args.envs
                 updates = 0 if warming else int((step + 1) * quota) - int(step * quota)
-                losses += [learn(std) for _ in range(updates)]
+                losses += [learn() for _ in range(updates)]
                 bar.update(args.envs)
                 if out_of_time():
                     done = True
@@ -313,28 +315,23 @@ def train(args, config, planner):
             if warming and decisions >= config.seed_decisions:  # catch up on the random episodes
                 for _ in tqdm(range(int(config.updates_per_step * decisions)), desc="first updates",
                               leave=False):
-                    losses.append(learn(std))
+                    losses.append(learn())
             recent = [[float(x) for x in row] for row in losses[-100:]]
             terms = np.mean(recent or [[0] * 3], 0)
             elapsed = seconds + time.time() - began
             bar.set_postfix_str(f"return {returns.mean():.0f} (best {returns.max():.0f}) "
                                 f"consistency {terms[0]:.4f} reward {terms[1]:.4f} "
                                 f"value {terms[2]:.3f}")
-            new = not (out / "curve.csv").exists()
-            with open(out / "curve.csv", "a", newline="") as f:
-                writer = csv.writer(f)
-                if new:
-                    writer.writerow(["decisions", "minutes", "std", "horizon", "return_mean",
-                                     "return_min", "return_max", "consistency", "reward", "value"])
-                writer.writerow([decisions, round(elapsed / 60, 2), round(std, 3), horizon,
-                                 round(float(returns.mean()), 1), round(float(returns.min()), 1),
-                                 round(float(returns.max()), 1), *(f"{t:.5g}" for t in terms)])
-            state = {"settings": settings, "learner": learner.state(), "decisions": decisions,
-                     "seconds": elapsed, **replay.state(), "rng": rng.bit_generator.state,
-                     "torch_rng": torch.get_rng_state(),
+            curve.append([decisions, round(elapsed / 60, 2), round(std, 3), horizon,
+                          *(round(float(f(returns)), 1) for f in (np.mean, np.min, np.max)),
+                          *map(float, terms)])
+            state = {"curve": curve, "settings": settings, "learner": learner.state(),
+                     "decisions": decisions, "seconds": elapsed, **replay.state(),
+                     "rng": rng.bit_generator.state, "torch_rng": torch.get_rng_state(),
                      "cuda_rng": torch.cuda.get_rng_state_all()}
             with fac.atomic_file(checkpoint) as file:
                 torch.save(state, file)
+            fac.write_curve(out / "curve.csv", CURVE, curve)  # after it: a kill doubles no row
     return learner, replay, decisions, elapsed / 60, decisions >= args.decisions
 
 
@@ -582,7 +579,7 @@ def main(argv=None):
     parser.add_argument("--seed", type=fac.natural, default=1)
     parser.add_argument("--envs", type=fac.natural, default=8,
                         help="environments stepped side by side [8]")
-    parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 1) // 2),
+    parser.add_argument("--workers", type=int, default=max(1, fac.cores() // 2),
                         help="processes that step them, at least one")
     parser.add_argument("--threads", type=int, default=0, help="PyTorch threads; 0: its default")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")

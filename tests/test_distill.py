@@ -8,16 +8,22 @@ from test_planning import random_model
 CONFIG = fac.DistillConfig(steps=300, batch_size=16, warmup=20, lr=3e-3, horizon=3)
 
 
-@pytest.fixture(scope="module")
-def replay(tmp_path_factory):
+def write_replay(path, task="", mark=None):
+    """24 episodes of 30 decisions; `mark`: what the held-out episodes' observations are set to."""
     rng = np.random.default_rng(0)
     observation = rng.standard_normal((24 * 31, 8)).astype(np.float16)
     action = rng.uniform(-1, 1, (24 * 31, 3)).astype(np.float16)
     continues = np.tile(np.arange(31) < 30, 24)
-    path = tmp_path_factory.mktemp("replay") / "replay.npz"
-    fac.write_npz(path, {"kind": "replay"}, {"observation": observation, "action": action,
-                                             "continues": continues})
+    if mark:
+        observation[np.arange(24 * 31) // 31 == 19] = mark  # CONFIG holds out one in 20
+    fac.write_npz(path, {"kind": "replay", "task": task}, {
+        "observation": observation, "action": action, "continues": continues})
     return fac.Replay(path)
+
+
+@pytest.fixture(scope="module")
+def replay(tmp_path_factory):
+    return write_replay(tmp_path_factory.mktemp("replay") / "replay.npz")
 
 
 def distilled(replay, config, steps, num_agents=None, seed=0):
@@ -139,3 +145,46 @@ def test_learning_rate_schedule():
     assert rates[0] < rates[10] < rates[19] <= CONFIG.lr and rates[-1] < 0.001 * CONFIG.lr
     constant = fac.dataclasses.replace(CONFIG, **fac.paper_preset(fac.DistillConfig))
     assert {fac.learning_rate(constant, t) for t in range(50)} == {1e-4}
+
+
+def test_held_out_episodes_are_for_the_rank_correlation_alone(tmp_path, monkeypatch):
+    replay = write_replay(tmp_path / "replay.npz", mark=50)
+    config = fac.dataclasses.replace(CONFIG, encoder_input="observation")
+    distiller, _ = distilled(replay, config, 0)
+    for t in range(40):
+        assert np.abs(distiller.batch(t)[0]).max() < 10
+    seen, perturbed_batch = [], fac.perturbed_batch
+
+    def watched(expert, student, obs, *rest):
+        seen.append(obs)
+        return perturbed_batch(expert, student, obs, *rest)
+
+    monkeypatch.setattr(fac, "perturbed_batch", watched)
+    rank(distiller)
+    assert len(seen) == 1 and (seen[0] == 50).all()
+
+
+def test_new_targets_reach_the_batch(tmp_path):
+    """Half of reacher's states get another target, the rest of them is as it was [D7]."""
+    config = fac.dataclasses.replace(CONFIG, encoder_input="observation", batch_size=4000)
+    obs = {}
+    for task in ("reacher-hard", "walker-walk"):
+        replay = write_replay(tmp_path / f"{task}.npz", task)
+        distiller, _ = distilled(replay, config, 0)
+        obs[task] = distiller.batch(0)[0][0]
+    moved = (obs["reacher-hard"] != obs["walker-walk"])
+    assert moved[3].mean() > 0.45 and np.array_equal(moved[3], moved[4]) and moved[3].mean() < 0.55
+    assert not np.delete(moved, [3, 4], 0).any()
+    seen = obs["reacher-hard"][:, moved[3]]
+    heading = np.cumsum(seen[:3], 0)
+    target = seen[3:5] + 0.09 * np.stack([np.cos(heading).sum(0), np.sin(heading).sum(0)])
+    assert np.hypot(*target).max() < 0.201 and np.hypot(*target).min() > 0.049
+    assert abs(np.corrcoef(*target)[0, 1]) < 0.1  # x and y are two coordinates
+
+
+def test_no_two_uses_of_a_seed_share_numbers():
+    """NumPy pads a short key with zeros, so that [seed, 3] and [seed, 3, 0] are one stream."""
+    draws = {fac.stream(seed, use, i).integers(2 ** 62) for seed in (0, 3, 2 ** 40)
+             for use in ("batch", "own episode", "student") for i in (0, 1, 3)}
+    assert len(draws) == 27
+    assert fac.stream(0, "batch").random() == fac.stream(0, "batch", 0).random()

@@ -324,6 +324,24 @@ def test_hindsight_agrees_with_an_environment_that_has_that_target(segments):
                 assert abs(earned - reward[t - 2, b]) <= 1
 
 
+def test_new_targets_lie_where_the_task_draws_them():
+    """Anywhere around the base, 0.05 to 0.2 away: seen from the finger, as observed."""
+    rng = np.random.default_rng(0)
+    obs = np.zeros((8, 4000), np.float32)
+    obs[:3] = rng.uniform([[-3], [-1.4], [-1.4]], [[3], [1.4], [1.4]], (3, 4000))
+    target = fac.new_targets(obs, rng) + finger_position(obs[:3].T).T
+    distance, angle = np.hypot(*target), np.arctan2(*target[::-1])
+    assert 0.05 - 1e-6 <= distance.min() < 0.052 and 0.198 < distance.max() <= 0.2 + 1e-6
+    for values, low, high in ((distance, 0.05, 0.2), (angle, -np.pi, np.pi)):
+        counts, _ = np.histogram(values, 10, (low - 1e-6, high + 1e-6))
+        assert counts.min() > 300 and counts.max() < 500  # even
+    env, seen = environment("reacher-hard"), []
+    for seed in range(200):
+        env.reset(seed)
+        seen.append(np.linalg.norm(env._env.physics.named.data.geom_xpos["target", :2]))
+    assert 0.05 <= min(seen) < 0.06 and 0.19 < max(seen) <= 0.2
+
+
 # environments in processes ------------------------------------------------------------
 
 

@@ -121,10 +121,11 @@ def test_golden_loss_and_gradients(source, dtype):
 
 @pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="needs PyTorch")
 @pytest.mark.parametrize("dtype, tolerance", [(np.float64, 1e-9), (np.float32, 2e-3)])
-def test_ten_updates_are_pytorch_s(dtype, tolerance):
+def test_ten_updates_are_pytorch_s(dtype, tolerance, monkeypatch):
     """Adam divides a gradient by its own size: in float32, rounding moves small ones visibly."""
     import torch
     import train_expert
+    monkeypatch.setattr(fac, "POLICY_STD", 0)  # the two draw different numbers
     rng = np.random.default_rng(3)
     ours = small_learner(rng, dtype)
     config = dataclasses.replace(CONFIG, grad_clip=0.5, tau=0.1)
@@ -139,7 +140,7 @@ def test_ten_updates_are_pytorch_s(dtype, tolerance):
     # the moving average has a policy of its own in PyTorch's form, which nothing reads
     for t in range(10):
         obs, actions, reward = small_batch(np.random.default_rng(t), dtype=dtype)
-        found, _ = ours.update(obs, actions, reward, 0.0, rng)
+        found, _ = ours.update(obs, actions, reward, rng)
         expected = theirs.update(*(torch.tensor(np.ascontiguousarray(x.swapaxes(-1, -2)))
                                    if x.ndim == 3 else torch.tensor(x)
                                    for x in (obs, actions, reward)), 0.0)
@@ -173,8 +174,34 @@ def test_the_averages_follow_every_second_update():
     learner = small_learner(rng, np.float32)
     batch = small_batch(rng, dtype=np.float32)
     slow = learner.slow_vector.copy()
-    learner.update(*batch, 0.1, rng)
+    learner.update(*batch, rng)
     assert np.array_equal(learner.slow_vector, slow)
-    learner.update(*batch, 0.1, rng)
+    learner.update(*batch, rng)
     assert np.allclose(learner.slow_vector, slow + 0.01 * (learner.optimizer.vector - slow))
     assert learner.slow_vector.dtype == learner.optimizer.vector.dtype == np.float32
+
+
+def test_the_policy_s_noise_is_constant_and_cut():
+    """TD-MPC's: deviation 0.05, whatever the exploration's is by then; no more than 0.3."""
+    noise = fac.policy_noise((200_000,), np.random.default_rng(0))
+    assert noise.dtype == np.float32
+    assert abs(noise.std() - 0.05) < 1e-3 and abs(noise.mean()) < 1e-3
+
+    class Far:
+        def standard_normal(self, shape, dtype):
+            return np.linspace(-20, 20, shape[0], dtype=dtype)
+
+    assert np.abs(fac.policy_noise((41,), Far())).max() == np.float32(0.3)
+
+
+def test_an_update_s_targets_and_policy_see_that_noise(monkeypatch):
+    """With another deviation, target and policy learn something else; the rest is the same."""
+    terms = []
+    for std in (0.05, 0.05, 0.5):
+        monkeypatch.setattr(fac, "POLICY_STD", std)
+        rng = np.random.default_rng(5)
+        learner = small_learner(rng, np.float32)
+        found, _ = learner.update(*small_batch(rng, dtype=np.float32), rng)
+        terms.append((*found, learner.policy_optimizer.adam.m.sum()))
+    assert terms[0] == terms[1] and terms[0][:2] == terms[2][:2]
+    assert terms[0][2] != terms[2][2] and terms[0][3] != terms[2][3]

@@ -353,3 +353,53 @@ def test_a_gain_of_zero_is_a_gain_all_the_same():
     fast.start(z, config)
     plain = fac.h_step_return(model, z, actions, config)
     assert np.abs(fast(actions) - plain).max() < 1e-5 * np.abs(plain).max()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_returns_that_are_not_finite_are_never_elites(bad):
+    target = np.full((2, 3, 1), 0.2, np.float32)
+
+    def returns(actions):
+        G = quadratic(target)(actions)
+        G[actions[:, 0, 0] > 0.5] = bad
+        return G
+
+    config = fac.dataclasses.replace(CONFIG, samples=64, elites=60)  # more than there are
+    mean, elites, weights = fac.mppi(returns, np.zeros_like(target), config, streams(2))
+    assert np.isfinite(mean).all() and np.allclose(weights.sum(1), 1, atol=1e-6)
+    assert not weights[elites[:, 0, 0] > 0.5].any() and np.abs(mean - target).max() < 0.2
+    with pytest.raises(fac.UserError, match="no action sequence has a finite return"):
+        fac.mppi(lambda actions: np.full((2, 64), bad, np.float32), np.zeros_like(target), config,
+                 streams(2))
+
+
+def test_weights_out_of_range_are_an_error_not_an_action():
+    model = random_model()
+    model.params["_Q1.5.bias"][:] = np.inf
+    for workers in (0, 2):
+        with fac.Planner(model, fac.PlannerConfig(samples=16), workers=workers) as planner:
+            with pytest.raises(fac.UserError, match="finite return"):
+                planner.act(np.zeros(8))
+
+
+def test_without_a_seed_every_planner_is_another():
+    plans = [fac.Planner(random_model(), fac.PlannerConfig(samples=16), seed=None).act(np.zeros(8))
+             for _ in range(2)]
+    assert not np.array_equal(*plans)
+
+
+def test_after_a_dead_worker_the_planner_says_so_again():
+    with fac.Planner(random_model(), fac.PlannerConfig(samples=16), workers=1) as planner:
+        os.kill(planner._workers._members[0][0].pid, signal.SIGKILL)
+        for message in ("ended with exit code -9", "was stopped before", "was stopped before"):
+            with pytest.raises(fac.WorkerError, match=message):
+                for _ in range(3):
+                    planner.act(np.zeros(8))
+
+
+def test_cores_are_those_this_process_may_use(monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 5, 7}, raising=False)
+    assert fac.cores() == fac.worker_count(None, 20) == 3 and fac.useful_workers(6) == 2
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert fac.cores() == 64

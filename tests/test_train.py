@@ -76,6 +76,26 @@ def play(parts, seed=4, policy=True):
     return np.stack(episode.action)
 
 
+@pytest.mark.parametrize("std", [0.0, 0.2])
+def test_exploration_adds_noise_of_its_deviation(std):
+    """Played twice with the same plans: what differs is the noise."""
+    class Still:
+        warm_start = None
+
+        def reset(self, seed):
+            pass
+
+        def act(self, obs):
+            return np.full(3, 0.1, np.float32)
+
+    episode = fac.Exploration(fac.Environment("reacher-easy"), 0, std)
+    episode.play(Still(), 300)
+    noise = np.stack(episode.action) - np.float32(0.1)
+    assert abs(noise.std() - std) <= 0.1 * std and abs(noise.mean()) <= 0.1 * std
+    if std:
+        assert len(np.unique(noise)) == noise.size
+
+
 def test_an_episode_may_get_new_weights_on_its_way():
     whole = play([(0, 12)])
     assert np.array_equal(play([(0, 5), (0, 7)]), whole)  # warm start and random streams go on
