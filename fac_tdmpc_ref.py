@@ -35,7 +35,6 @@ from the paper are tagged [D1], [D2], ...; the README lists them with what each 
 from __future__ import annotations
 
 import argparse
-import collections
 import contextlib
 import csv
 import dataclasses
@@ -110,25 +109,20 @@ class PlannerConfig:
     iterations: int = field(6, "refinements of the proposal in a decision (Table 2)")
     elites: int = field(0, "sequences that refine the proposal; 0: samples / 8 (Table 2: 64)")
     pi_trajs: int = field(24, "policy proposals, where the model has a policy (Table 2)")
-    horizon: int = field(1, "H: rewards that are summed before Q (H - 1 with value_at last) [D5]",
-                         paper=3)
-    value_at: str = field("auto", "where Q ends the return: after (Equation 2: H rewards, then Q "
-                          "of action H + 1), last (authors' code: Q of action H, alone if H is 1), "
-                          "both (their mean), turns (after for 50 decisions, both for 150, "
-                          "and again) or auto: after for experts, turns for students [D5]",
-                          paper="after", choices=("auto", "after", "last", "both", "turns"))
+    horizon: int = field(3, "H of Equation 2: H rewards, then Q of action H + 1; 0: Q alone "
+                         "(Table 2)")
     discount: float = field(0.99, "gamma, where the model's file names no other (Table 2)")
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)")
     max_std: float = field(2.0, "first and largest sampling deviation (Table 2)")
     temperature: float = field(0.5, "an elite weighs exp(temperature * return) (Table 2)")
     momentum: float = field(0.1, "share of the old mean that is kept (TD-MPC's code)")
+    returns: str = field("fast", "the same return as it reads (plain: h_step_return), or fast",
+                         choices=("fast", "plain"))
     output: str = field("sampled", "the action: sampled from the elites by weight (TD-MPC's code) "
                         "or the proposal's mean (the paper's text)", choices=("sampled", "mean"))
 
     def __post_init__(self):
-        if self.elites == 0:
-            object.__setattr__(self, "elites", max(1, self.samples // 8))
-        for name, least in (("samples", 1), ("iterations", 1), ("elites", 1), ("horizon", 1),
+        for name, least in (("samples", 1), ("iterations", 1), ("elites", 0), ("horizon", 0),
                             ("pi_trajs", 0), ("temperature", 0)):
             if not least <= getattr(self, name) < np.inf:  # nan is not, either
                 raise UserError(f"planner: {name} must be at least {least} and finite, not "
@@ -146,43 +140,9 @@ class PlannerConfig:
         check_choices(self)
 
     @property
-    def ends(self):
-        """How many rewards go before Q: H, or one less, or ("both") the mean of these returns."""
-        if self.value_at in ("auto", "turns"):
-            raise UserError(f"planner: value_at {self.value_at} depends on the "
-                            f"{'model' if self.value_at == 'auto' else 'decision'}; choose after, "
-                            f"last or both")
-        return {"after": [self.horizon], "last": [self.horizon - 1],
-                "both": [self.horizon - 1, self.horizon]}[self.value_at]
-
-    @property
-    def rewards(self):
-        """Rewards in the return; the sequence has one action more, which only Q sees."""
-        return self.ends[-1]
-
-    @property
-    def weights(self):
-        """What the return is summed with: the rewards' weights, and {h: weight of Q}."""
-        gamma, ends = float(self.discount), self.ends
-        return ([gamma ** h * sum(h < end for end in ends) / len(ends) for h in range(ends[-1])],
-                {end: gamma ** end / len(ends) for end in ends})
-
-    @property
-    def turns(self):
-        """What plans in turn, TURN decisions each: this alone, or the forms of "turns".
-
-        Equation 2 gets a walker off the ground, the mean mostly holds an arm on its target [D5].
-        """
-        if self.value_at != "turns":
-            return (self,)
-        after, both = (dataclasses.replace(self, value_at=form) for form in ("after", "both"))
-        return after, both, both, both
-
-    def settled(self, model):
-        """This, with "auto" replaced by what suits the model: only experts have a policy."""
-        if self.value_at != "auto":
-            return self
-        return dataclasses.replace(self, value_at="after" if model.has_policy else "turns")
+    def num_elites(self):
+        """E: `elites`, or their default for this many samples."""
+        return self.elites or max(1, self.samples // 8)
 
 
 @dataclass(frozen=True)
@@ -196,8 +156,7 @@ class DistillConfig:
                                  "logarithm [D8]", paper=0.5)
     clip_actions: bool = field(True, "clip perturbed actions to [-1, 1], where planning looks [D8]",
                                paper=False)
-    horizon: int = field(1, "H: steps of the latent rollout [D5]", paper=3)
-    final_term: bool = field(True, "sum over h = 0..H as printed; off: 0..H-1 as the authors' code")
+    horizon: int = field(3, "H: the loss sums over h = 0..H, planning looks as far (Table 2)")
     lam: float = field(1.0, "lambda: weight of step h is lambda^h (rho in Table 2) [D5]", paper=0.5)
     reward_coef: float = field(0.5, "weight of the rewards' divergence (Table 2)")
     value_coef: float = field(0.1, "weight of each Q's divergence (Table 2)")
@@ -226,7 +185,7 @@ class DistillConfig:
     held_out: float = field(0.05, "share of episodes kept for the rank correlation")
 
     def __post_init__(self):
-        for name, least in (("steps", 1), ("batch_size", 1), ("horizon", 1), ("noise_samples", 2),
+        for name, least in (("steps", 1), ("batch_size", 1), ("horizon", 0), ("noise_samples", 2),
                             ("lam", 0), ("reward_coef", 0), ("value_coef", 0), ("warmup", 0),
                             ("own_episodes", 0)):
             if not least <= getattr(self, name) < np.inf:
@@ -243,19 +202,13 @@ class DistillConfig:
         for name in ("new_targets", "own_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise UserError(f"distillation: {name} is a share, not {getattr(self, name)}")
-        if self.terms > EPISODE_STEPS:
-            raise UserError(f"distillation: horizon must be "
-                            f"{'below' if self.final_term else 'at most'} an episode's "
-                            f"{EPISODE_STEPS}, not {self.horizon}")
+        if self.horizon >= EPISODE_STEPS:
+            raise UserError(f"distillation: horizon must be below an episode's {EPISODE_STEPS}, "
+                            f"not {self.horizon}")
         if not 0 < self.held_out <= 0.5:
             raise UserError(f"distillation: held_out must lie between 0 and 0.5, not "
                             f"{self.held_out}")
         check_choices(self)
-
-    @property
-    def terms(self):
-        """Steps h of the loss: one more than transitions of the latent rollout."""
-        return self.horizon + self.final_term
 
 
 @dataclass(frozen=True)
@@ -966,7 +919,7 @@ class Distiller:
 
     def __init__(self, expert, replay, config, num_agents=None, seed=0):
         sizes = expert.config
-        self.train_starts, self.held_out_starts = replay.starts(config.terms, config.held_out)
+        self.train_starts, self.held_out_starts = replay.starts(config.horizon + 1, config.held_out)
         if (replay.dim_obs, replay.dim_action) != (sizes.dim_obs, sizes.dim_action):
             raise UserError(f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, "
                             f"{replay.dim_action}), the expert expects ({sizes.dim_obs}, "
@@ -986,10 +939,10 @@ class Distiller:
         """Line 4 and the expert's part of step t: features, perturbed actions, targets."""
         rng = stream(self.seed, "batch", t)
         starts = rng.choice(self.train_starts, self.config.batch_size)
-        obs, actions = self.replay.sequences(starts, self.config.terms)
+        obs, actions = self.replay.sequences(starts, self.config.horizon + 1)
         if len(self.own):  # the first ones are the student's own [D9]
             own, actions[..., :self.own_count], _ = self.own.sample(
-                rng, self.own_count, self.config.terms, "")
+                rng, self.own_count, self.config.horizon + 1, "")
             obs[:, :self.own_count] = own[0]
         task = str(self.replay.header.get("task"))
         if task.startswith("reacher"):  # [D7]
@@ -1064,7 +1017,7 @@ def rank_correlation(distiller, states, seed):
     rng = stream(seed, "rank correlation")
     starts = rng.choice(distiller.held_out_starts, states)
     student, config = distiller.student, dataclasses.replace(distiller.config, noise_samples=32)
-    sequences = distiller.replay.sequences(starts, distiller.config.terms)
+    sequences = distiller.replay.sequences(starts, distiller.config.horizon + 1)
     features, actions, (_, *q_expert) = perturbed_batch(distiller.expert, student, *sequences,
                                                         config, rng)
     _, *q_student = predict(student, student.encode_features(features), actions)
@@ -1081,22 +1034,20 @@ def rank_correlation(distiller, states, seed):
 
 
 def h_step_return(model, z, actions, config):
-    """Equation 2 for every agent, or its kin [D5], as it reads; `Returns` computes it faster.
+    """Equation 2 for every agent as it reads; `Returns` computes the same faster.
 
-    z (N, m, 1), actions (N, L, d, S) -> G (N, S), summed with `config.weights`. Q is the mean of
-    the two: unlike TD-MPC's minimum, a mean of sums is the sum of means, as Proposition 1 needs
-    [D4].
+        G = sum_{h=0}^{H-1} gamma^h r(s_h, a_h) + gamma^H Q(s_H, a_H),   s_{h+1} = f_T(s_h, a_h)
+
+    z (N, m, 1), actions (N, H + 1, d, S) -> G (N, S). Q is the mean of the two: unlike TD-MPC's
+    minimum, a mean of sums is the sum of means, as Proposition 1 needs [D4].
     """
+    gamma, G = config.discount, 0.0
     z = np.repeat(z, actions.shape[-1], axis=2)
-    total, (rewards, values) = 0.0, config.weights
-    for h in range(len(rewards) + 1):
-        if h in values:
-            q1, q2 = model.q(z, actions[:, h])
-            total = total + values[h] * (q1 + q2) / 2
-        if h < len(rewards):
-            total = total + rewards[h] * model.reward(z, actions[:, h])
-            z = model.next(z, actions[:, h])
-    return total
+    for h in range(config.horizon):
+        G = G + gamma ** h * model.reward(z, actions[:, h])
+        z = model.next(z, actions[:, h])
+    q1, q2 = model.q(z, actions[:, config.horizon])
+    return G + gamma ** config.horizon * (q1 + q2) / 2
 
 
 def homogeneous(params, layer):
@@ -1157,10 +1108,12 @@ class Returns:
 
     def start(self, z, config):
         """Plan from the latent z (N, m, 1): at h = 0 the first products read (a, 1) only."""
-        self.weights, m = config.weights, self.sizes.latent_dim
+        self.horizon, self.discount = config.horizon, config.discount
+        m = self.sizes.latent_dim
         self.first_at_start = [W[:, :, m:].copy() for W in self.first]  # (N, 2h + 2, d + 1)
         for W, at_start in zip(self.first, self.first_at_start):
             at_start[..., -1:] += W[:, :, :m] @ z
+        return self
 
     def __call__(self, actions):
         """actions (N, L, d, S) -> G (N, S)."""
@@ -1184,20 +1137,17 @@ class Returns:
         if width not in self._buffers:
             self._buffers[width] = self._make_buffers(width)
         x, y, y2, out = self._buffers[width]                            # x is (z, a, 1)
-        rewards, values = self.weights
-        for h in range(len(rewards) + 1):
+        for h in range(self.horizon + 1):
             x[:, m:-1] = actions[:, h]
-            if h in values:
-                self._hidden(1, h, x, y, y2)
+            last = h == self.horizon
+            self._hidden(int(last), h, x, y, y2)
+            if last:
                 np.matmul(self.to_q, y2, out=out)
-                out *= values[h]
-                total += out[:, 0]
-            if h < len(rewards):
-                self._hidden(0, h, x, y, y2)
+            else:
                 np.matmul(self.to_reward, y2[:, half:], out=out)
-                out *= rewards[h]
-                total += out[:, 0]
                 np.matmul(self.to_latent, y2[:, :half], out=x[:, :m])
+            out *= self.discount ** h
+            total += out[:, 0]
 
     def _hidden(self, pair, h, x, y, y2):
         """Both hidden layers of a pair of networks (0: dynamics and reward, 1: the two Q)."""
@@ -1237,7 +1187,7 @@ def mppi(returns, mean, config, rngs, proposals=None):
     one Generator for each agent; proposals (N, L, d, P): sequences that compete in every
     iteration. Elites are chosen agent by agent, which Proposition 1 allows: with N = 1 this is
     centralized MPPI. Returns the new mean (N, L, d), the last elites (N, L, d, E) and their
-    weights (N, E), which sum to 1.
+    scores (N, E), which sum to 1.
     """
     mean, std = mean[..., None], F32(config.max_std)
     if proposals is not None:
@@ -1256,60 +1206,56 @@ def mppi(returns, mean, config, rngs, proposals=None):
         if np.isneginf(G.max(1)).any():
             raise UserError("planning: no action sequence has a finite return; the model's weights "
                             "or the observation are far out of range")
-        best = np.argpartition(-G, config.elites - 1, axis=1)[:, :config.elites]
+        best = np.argpartition(-G, config.num_elites - 1, axis=1)[:, :config.num_elites]
         elites = np.take_along_axis(actions, best[:, None, None], 3)
-        weights = np.take_along_axis(G, best, 1)
-        weights = np.exp(config.temperature * (weights - weights.max(1, keepdims=True)))
-        weights /= weights.sum(1, keepdims=True)
-        w = weights[:, None, None]
-        new = (w * elites).sum(3, keepdims=True)
-        std = np.sqrt((w * (elites - new) ** 2).sum(3, keepdims=True))
+        G = np.take_along_axis(G, best, 1)
+        scores = np.exp(config.temperature * (G - G.max(1, keepdims=True)))
+        scores /= scores.sum(1, keepdims=True)
+        p = scores[:, None, None]
+        new = (p * elites).sum(3, keepdims=True)
+        std = np.sqrt((p * (elites - new) ** 2).sum(3, keepdims=True))
         std = np.clip(std, config.min_std, config.max_std)
         mean = config.momentum * mean + (1 - config.momentum) * new
-    return mean[..., 0], elites, weights
-
-
-TURN = 50  # decisions that a student plans with one return before the next [D5]
+    return mean[..., 0], elites, scores
 
 
 class AgentPlanner:
     """Plans for the agents of one model: the same for all of them, for a share, for N = 1."""
 
     def __init__(self, model, config):
-        self.model, self.turns = model, config.settled(model).turns
-        self.returns = Returns(model)
+        self.model, self.config = model, config
+        self.returns = Returns(model) if config.returns == "fast" else None
         self.reset([])
 
     def reset(self, seeds):
         """Forget the warm start; seeds: one SeedSequence for each agent, [] to keep streams."""
-        sizes, length = self.model.config, self.turns[0].rewards + 1  # all alike
-        self.t, self.mean = 0, np.zeros((sizes.num_agents, length, sizes.agent_actions), F32)
+        sizes = self.model.config
+        self.mean = np.zeros((sizes.num_agents, self.config.horizon + 1, sizes.agent_actions), F32)
         if len(seeds):
             self.rngs = [np.random.Generator(np.random.SFC64(s)) for s in seeds]
 
     def plan(self, z):
         """z (N, m, 1) -> the agents' first actions (N, d); keeps the warm start."""
-        config = self.turns[self.t // TURN % len(self.turns)]
-        self.t += 1
-        self.returns.start(z, config)
-        mean, elites, weights = mppi(self.returns, self.mean, config, self.rngs,
-                                     self._proposals(z, config))
+        config = self.config
+        returns = (self.returns.start(z, config) if self.returns else
+                   functools.partial(h_step_return, self.model, z, config=config))
+        mean, elites, scores = mppi(returns, self.mean, config, self.rngs, self._proposals(z))
         self.mean[:, :-1], self.mean[:, -1] = mean[:, 1:], 0
         if config.output == "mean":
             return mean[:, 0]
-        pick = [min(np.searchsorted(np.cumsum(w), rng.random(), "right"), len(w) - 1)
-                for w, rng in zip(weights, self.rngs)]
+        pick = [min(np.searchsorted(np.cumsum(p), rng.random(), "right"), len(p) - 1)
+                for p, rng in zip(scores, self.rngs)]
         return np.stack([e[0, :, i] for e, i in zip(elites, pick)])
 
-    def _proposals(self, z, config):
+    def _proposals(self, z):
         """Noisy policy rollouts (1, L, A, P), where there is a policy (TD-MPC's code)."""
-        if not (self.model.has_policy and config.pi_trajs):
+        if not (self.model.has_policy and self.config.pi_trajs):
             return None
-        z, actions = np.repeat(z, config.pi_trajs, 2), []
-        for h in range(config.rewards + 1):
+        z, actions = np.repeat(z, self.config.pi_trajs, 2), []
+        for h in range(self.config.horizon + 1):
             mu = self.model.policy(z)
             actions.append(np.clip(mu + policy_noise(mu.shape, self.rngs[0]), -1, 1))
-            if h < config.rewards:
+            if h < self.config.horizon:
                 z = self.model.next(z, actions[-1])
         return np.stack(actions, 1)
 
@@ -1361,11 +1307,11 @@ class Planner:
     @property
     def warm_start(self):
         """What an episode hands to its next decision, where all is planned in this process."""
-        return self._own.mean, self._own.rngs, self._own.t
+        return self._own.mean, self._own.rngs
 
     @warm_start.setter
     def warm_start(self, state):
-        self._own.mean, self._own.rngs, self._own.t = state
+        self._own.mean, self._own.rngs = state
 
     def act(self, obs):
         """obs (O,), anything that converts to float32 -> action (A,) float32 in [-1, 1]."""
@@ -2048,8 +1994,8 @@ def check_task(sizes, task):
 def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="evaluating"):
     """Returns of `episodes` episodes, run side by side in `workers` processes (0: in this one).
 
-    Gives {"returns", "seeds", "seed", "planner" (the settled settings), "plan_ms_median" (of the
-    episodes' mean decisions)}.
+    Gives {"returns", "seeds", "seed", "planner" (its settings), "plan_ms_median" (of the episodes'
+    mean decisions)}.
     An episode depends on its seed alone, so the returns are the same for every number of workers.
     """
     check_task(model.config, task)
@@ -2070,7 +2016,7 @@ def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="eval
                                     f"{rewards.sum() * EPISODE_STEPS / bar.n:.0f}", False)
     returns = rewards.sum(1)  # here, so that the parts' sizes don't matter
     return {"returns": [float(r) for r in returns], "seeds": seeds, "seed": seed,
-            "planner": dataclasses.asdict(config.settled(model)),
+            "planner": dataclasses.asdict(config),
             "plan_ms_median": 1e3 / EPISODE_STEPS * float(np.median(seconds))}
 
 
@@ -2288,125 +2234,142 @@ def output_folder(path):
     return Path(path)
 
 
-def check_dynamics(config, planning):
-    """UserError if a student would plan with dynamics that distillation leaves as they were."""
-    if config.terms == 1 and any(turn.rewards for turn in planning.turns):
-        raise UserError("horizon 1 without the final term distils no dynamics, which the student "
-                        "plans with; raise the horizon, keep the term, or have it plan with "
-                        "--plan-value-at last --plan-horizon 1 (evaluate: without 'plan-')")
-
-
 def command_distill(args):
     """distill: expert and replay in, student, learning curve, table and JSON out."""
     began = time.time()
-    config, planning = (from_args(part, args, **(
-        paper_preset(part) if args.preset == "paper" else {})) for part in (DistillConfig,
-                                                                           PlannerConfig))
+    preset = paper_preset if args.preset == "paper" else lambda config: {}
+    config = from_args(DistillConfig, args, **preset(DistillConfig))
+    planning = from_args(PlannerConfig, args, **preset(PlannerConfig), horizon=config.horizon)
     lookup_task(args.task)
     if args.episodes < 1:
         raise UserError(f"episodes must be at least 1, not {args.episodes}")
+    expert, header, replay, where = load_data(args)
+    if getattr(args, "PlannerConfig.discount") is None:
+        planning = dataclasses.replace(planning, discount=trained_discount(header, where))
+    out = output_folder(args.out or f"runs/{args.task}-{args.seed}")
+    with contextlib.closing(Distiller(expert, replay, config, args.num_agents,
+                                      args.seed)) as distiller:
+        agents = distiller.student.config.num_agents
+        beside = useful_workers(agents) if args.plan_workers is None else args.plan_workers
+        shares(agents, beside)  # refuses too many
+        result = distil(distiller, args, planning, header, out)
+    obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
+    result.update(evaluate_both(expert, distiller.student, header, args, planning))
+    result.update(time_both(expert, distiller.student, planning, obs, beside,
+                            keep=args.plan_workers is not None))
+    result["seconds_total"] = round(time.time() - began, 1)
+    with atomic_file(out / "result.json", "w") as file:
+        json.dump(result, file, indent=1)
+    (out / "checkpoint.npz").unlink(missing_ok=True)
+    report(result, planning, args.eval_seed)
+    return result
+
+
+def load_data(args):
+    """(expert, its header, replay, the expert's path) that distill's arguments name."""
     if args.expert and os.path.isdir(args.expert):  # as `train` and data/TASK hold them
         args.replay = args.replay or Path(args.expert) / "replay.npz"
         args.expert = Path(args.expert) / "expert.npz"
-    expert_path = args.expert or data_file(args.task, "expert.npz")
-    expert, header = load_model(expert_path)
+    path = args.expert or data_file(args.task, "expert.npz")
+    expert, header = load_model(path)
     for key, expected in (("kind", "expert"), ("task", args.task)):
         if header.get(key) != expected:
-            raise UserError(f"{expert_path}: header: {key}: expected {expected!r}, found "
+            raise UserError(f"{path}: header: {key}: expected {expected!r}, found "
                             f"{header.get(key)!r}")
     check_task(expert.config, args.task)
-    if getattr(args, "PlannerConfig.discount") is None:
-        planning = dataclasses.replace(planning, discount=trained_discount(header, expert_path))
-    Environment(args.task)  # what is missing is missed now, not after a quarter of the steps
-    replay = Replay(args.replay or data_file(args.task, "replay.npz"))
-    out = output_folder(args.out or f"runs/{args.task}-{args.seed}")
-    distiller = Distiller(expert, replay, config, args.num_agents, args.seed)
-    num_agents = distiller.student.config.num_agents
-    check_dynamics(config, planning.settled(distiller.student))
-    playing = dataclasses.replace(planning, samples=64, iterations=3, elites=8)  # cheap [D9]
-    beside = useful_workers(num_agents) if args.plan_workers is None else args.plan_workers
-    shares(num_agents, beside)  # refuses too many
-    settings = {"task": args.task, "seed": args.seed, "num_agents": num_agents,
+    Environment(args.task)  # what is missing is missed now, not after the last step
+    return expert, header, Replay(args.replay or data_file(args.task, "replay.npz")), path
+
+
+def distil(distiller, args, planning, header, out):
+    """Algorithm 1 to its end; writes student, curve and configuration. Returns result's part."""
+    student, config, replay = distiller.student, distiller.config, distiller.replay
+    playing = dataclasses.replace(planning, samples=64, iterations=3)  # cheap [D9]
+    settings = {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
                 "distill": dataclasses.asdict(config),
                 "own_planner": dataclasses.asdict(playing) if distiller.own_count else None,
-                "data": [checksum(expert.params.values()),
+                "data": [checksum(distiller.expert.params.values()),
                          checksum([replay.observation, replay.action, replay.ends]),
                          replay.header.get("task")]}
-    print(f"{args.task}: {num_agents} agents of {distiller.student.config.latent_dim} latent "
+    print(f"{args.task}: {student.config.num_agents} agents of {student.config.latent_dim} latent "
           f"features, {len(distiller.optimizer.vector):,} weights; replay of "
           f"{replay.transitions:,} transitions; {config.steps:,} steps of {config.batch_size} x "
           f"{config.noise_samples}; results in {out}", file=sys.stderr)
-    with contextlib.closing(distiller):
-        curve, seconds = train_student(distiller, out, settings, playing, args.workers)
-        rank = rank_correlation(distiller, 256, args.seed)
-    student = distiller.student
+    curve, seconds = train_student(distiller, out, settings, playing, args.workers)
+    rank = rank_correlation(distiller, 256, args.seed)
     save_model(out / "student.npz", student, {"kind": "student", **settings,
                                               "training": header.get("training", {})})
     with atomic_file(out / "config.json", "w") as file:
         json.dump({**settings, "planner": dataclasses.asdict(planning)}, file, indent=1)
-    drawn = draw_curve(out / "curve.png", curve, f"{args.task}, seed {args.seed}")
+    return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
+            "steps": config.steps, "seconds": round(seconds, 1), "kl_reward": curve[-1][3],
+            "kl_value": curve[-1][4], "rank_correlation": float(rank[0]),
+            "rank_correlation_by_step": [float(r) for r in rank], "out": str(out),
+            "picture": draw_curve(out / "curve.png", curve, f"{args.task}, seed {args.seed}")}
 
-    seeds = episode_seeds(args.eval_seed, args.episodes)
-    own, alike = planning.settled(expert), planning.settled(student)
-    found = evaluate(student, args.task, planning, args.episodes, args.eval_seed, args.workers,
-                     "evaluating the student")
-    returns = recorded_returns(header, own, seeds)
+
+def evaluate_both(expert, student, header, args, planning):
+    """The student's returns and the expert's, recorded or measured: result's part."""
+    where = args.task, planning, args.episodes, args.eval_seed, args.workers
+    theirs = evaluate(student, *where, "evaluating the student")["returns"]
+    returns = recorded_returns(header, planning, episode_seeds(args.eval_seed, args.episodes))
     recorded = returns is not None and not args.evaluate_expert
     if not recorded:
-        returns = evaluate(expert, args.task, planning, args.episodes, args.eval_seed, args.workers,
-                           "evaluating the expert")["returns"]
-    obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
-    subjects = ((expert, alike, 0), (student, alike, 0), (student, alike, beside),
-                *[(expert, own, 0)] * (own != alike))
-    kinds = [collections.Counter(form.turns) for _, form, _ in subjects]
+        returns = evaluate(expert, *where, "evaluating the expert")["returns"]
+    return {"episodes": args.episodes, "expert_recorded": recorded,
+            "expert_return_mean": float(np.mean(returns)),
+            "expert_return_std": float(np.std(returns)),
+            "student_return_mean": float(np.mean(theirs)),
+            "student_return_std": float(np.std(theirs)),
+            "kept": kept(np.mean(theirs), np.mean(returns)),
+            "student_returns": theirs, "expert_returns": returns}
+
+
+def time_both(expert, student, planning, obs, beside, keep):
+    """Milliseconds of a decision, both planning alike: result's part.
+
+    Where `beside` workers cost more than they save, the student's are those of one process,
+    unless they are to `keep`.
+    """
     with contextlib.ExitStack() as stack:
-        planners = [stack.enter_context(Planner(model, kind, workers=workers))
-                    for (model, _, workers), counts in zip(subjects, kinds) for kind in counts]
-        timed, _ = take_turns([functools.partial(p.act, obs) for p in planners], 20, "timing")
-    median = iter(np.median(timed, 0))
-    ms = [1e3 * float(sum(next(median) * n for n in counts.values())) / counts.total()
-          for counts in kinds]
-    ms += ms[:1] * (own == alike)  # the same planning, timed once
-    if not beside or (args.plan_workers is None and ms[2] >= ms[1]):
-        beside, ms[2] = 0, ms[1]  # handing over costs more than it saves
+        planners = [stack.enter_context(Planner(model, planning, workers=workers))
+                    for model, workers in ((expert, 0), (student, 0), (student, beside))]
+        seconds, _ = take_turns([functools.partial(p.act, obs) for p in planners], 20, "timing")
+    central, alone, parallel = (float(ms) for ms in 1e3 * np.median(seconds, 0))
+    if not beside or (not keep and parallel >= alone):
+        beside, parallel = 0, alone
+    return {"plan_ms_expert": central, "plan_ms_expert_own": central, "plan_ms_student": parallel,
+            "speedup": central / parallel,
+            "plan_ms_student_in_process": alone, "plan_workers": beside}
 
-    result = {
-        "task": args.task, "seed": args.seed, "steps": config.steps, "seconds": round(seconds, 1),
-        "expert_return_mean": float(np.mean(returns)), "expert_return_std": float(np.std(returns)),
-        "student_return_mean": float(np.mean(found["returns"])),
-        "student_return_std": float(np.std(found["returns"])),
-        "episodes": args.episodes, "kl_reward": curve[-1][3], "kl_value": curve[-1][4],
-        "rank_correlation": float(rank[0]), "plan_ms_expert": ms[0],
-        "plan_ms_student": ms[2], "speedup": ms[0] / ms[2], "expert_recorded": recorded,
-        "out": str(out), "rank_correlation_by_step": [float(r) for r in rank],
-        "plan_ms_student_in_process": ms[1], "plan_ms_expert_own": ms[3],
-        "plan_workers": beside,
-        "student_returns": found["returns"], "expert_returns": returns,
-        "seconds_total": round(time.time() - began, 1)}
-    with atomic_file(out / "result.json", "w") as file:
-        json.dump(result, file, indent=1)
-    (out / "checkpoint.npz").unlink(missing_ok=True)
 
-    print(f"\n{args.task}, {args.episodes} episodes, evaluation seed {args.eval_seed}, MPPI with "
-          f"{planning.samples} samples, {planning.iterations} iterations, horizon "
-          f"{planning.horizon}; value_at {own.value_at} (expert), {alike.value_at} (student)\n")
-    print_table([
-        ("", "return", "ms a decision", "speed-up"),
-        (f"expert ({'recorded' if recorded else 'measured now'}), one process",
-         f"{np.mean(returns):.0f} ± {np.std(returns):.0f}", f"{ms[3]:.1f}",
-         f"{ms[0] / ms[3]:.1f}")] + [
-        ("expert, planning like its student", "", f"{ms[0]:.1f}", "1.0")] * (own != alike) + [
-        (f"student, N = {num_agents}, one process",
-         f"{result['student_return_mean']:.0f} ± {result['student_return_std']:.0f}",
-         f"{ms[1]:.1f}", f"{ms[0] / ms[1]:.1f}")] + [
-        (f"student, {beside} worker{'s' * (beside != 1)} beside", "the same plans",
-         f"{ms[2]:.1f}", f"{ms[0] / ms[2]:.1f}")] * (beside > 0))
-    share = kept(np.mean(found["returns"]), np.mean(returns))
-    print(f"\nreturn kept {'-' if share is None else f'{share:.2f}'}, rank "
-          f"correlation of Q {rank[0]:.3f} (h = 0) to {rank[-1]:.3f} (h = {len(rank) - 1}), "
-          f"distilled in {seconds:.0f} s, {result['seconds_total']:.0f} s in all, {out}/"
-          + ("" if drawn else "\n(no picture: pip install 'fac-tdmpc-ref[plots]' draws curve.png)"))
-    return result
+def report(result, planning, eval_seed):
+    """Print distill's table."""
+    def row(name, kind, ms):
+        returns = (f"{result[f'{kind}_return_mean']:.0f} ± {result[f'{kind}_return_std']:.0f}"
+                   if kind else "the same plans")
+        return name, returns, f"{ms:.1f}", f"{result['plan_ms_expert'] / ms:.1f}"
+
+    print(f"\n{result['task']}, {result['episodes']} episodes, evaluation seed {eval_seed}, MPPI "
+          f"with {planning.samples} samples, {planning.iterations} iterations, horizon "
+          f"{planning.horizon}\n")
+    measured = "recorded" if result["expert_recorded"] else "measured now"
+    rows = [("", "return", "ms a decision", "speed-up"),
+            row(f"expert ({measured}), one process", "expert", result["plan_ms_expert"]),
+            row(f"student, N = {result['num_agents']}, one process", "student",
+                result["plan_ms_student_in_process"])]
+    beside = result["plan_workers"]
+    if beside:
+        rows.append(row(f"student, {beside} worker{'s' * (beside != 1)} beside", None,
+                        result["plan_ms_student"]))
+    print_table(rows)
+    rank = result["rank_correlation_by_step"]
+    share = "-" if result["kept"] is None else f"{result['kept']:.2f}"
+    print(f"\nreturn kept {share}, rank correlation of Q {rank[0]:.3f} (h = 0) to {rank[-1]:.3f} "
+          f"(h = {len(rank) - 1}), distilled in {result['seconds']:.0f} s, "
+          f"{result['seconds_total']:.0f} s in all, {result['out']}/"
+          + ("" if result["picture"] else
+             "\n(no picture: pip install 'fac-tdmpc-ref[plots]' draws curve.png)"))
 
 
 def kept(student, expert):
@@ -2532,7 +2495,7 @@ class OnlineStudent:
         config, t = self.config, self.optimizer.adam.t
         self._arena.rewind()
         batch = perturbed_batch(self.expert, self.model, obs,
-                                actions[:config.terms], config,
+                                actions[:config.horizon + 1], config,
                                 stream(self.seed, "perturbations", t), self._arena.empty)
         losses = distill_loss(self.model, *batch, config, self.optimizer.grads, self._arena.empty)
         self.optimizer.step(learning_rate(config, t), config.grad_clip)
@@ -2541,8 +2504,8 @@ class OnlineStudent:
 
 # for a few cores; hidden layers of 512, as in Table 2, make an update three times as dear
 TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
-FOLLOWING_DEFAULTS = {"noise_samples": 3}
-TRAINING_BUDGET = {"samples": 128, "iterations": 4, "horizon": 3, "value_at": "after"}
+FOLLOWING_DEFAULTS = {"noise_samples": 3, "horizon": 2}
+TRAINING_BUDGET = {"samples": 128, "iterations": 4}
 TRAINING_CURVE = ("decisions", "updates", "seconds", "std", "horizon", "return_mean", "return_min",
                   "return_max", "consistency", "reward", "value", "kl_reward", "kl_value",
                   "eval_expert", "eval_student")
@@ -2641,16 +2604,10 @@ class Training:
             f", {name} {r:.0f}" for name, r in tests.items()), False)
 
     def tests(self):
-        """An evaluation's models and tests, as Actors.begin takes them.
-
-        They plan with the training budget and the default horizon and value_at.
-        """
-        default = PlannerConfig()
-        testing = dataclasses.replace(self.planning, horizon=default.horizon,
-                                      value_at=default.value_at)
-        models = {"expert": (self.learner.model, testing)}
+        """An evaluation's models and tests, as Actors.begin takes them; the training's budget."""
+        models = {"expert": (self.learner.model, self.planning)}
         if self.student:
-            models["student"] = self.student.model, testing
+            models["student"] = self.student.model, self.planning
         return models, [(name, seed) for name in models for seed in episode_seeds(
             self.args.seed + 1, self.args.evaluate_episodes)]
 
@@ -2720,7 +2677,8 @@ def lag(curve, fraction):
 def command_train(args):
     """train: an expert (Equation 1) and, with --student fac, a student that follows it (C.1)."""
     config = from_args(ExpertConfig, args, **TRAINING_DEFAULTS)
-    planning = from_args(PlannerConfig, args, **TRAINING_BUDGET, discount=config.discount)
+    planning = from_args(PlannerConfig, args, **TRAINING_BUDGET, horizon=config.horizon,
+                         discount=config.discount)
     distilling = from_args(DistillConfig, args, **FOLLOWING_DEFAULTS)
     _, _, _, dim_action = lookup_task(args.task)
     quota = args.envs * EPISODE_STEPS
@@ -2739,11 +2697,10 @@ def command_train(args):
     else:
         args.num_agents = dim_action if args.num_agents is None else args.num_agents
         distilling = dataclasses.replace(distilling, steps=max(1, total))
-        if distilling.terms > config.horizon:
-            raise UserError(f"the student looks {distilling.terms} steps ahead, the expert's "
-                            f"batches hold {config.horizon}; lower --distill-horizon or raise "
-                            f"--horizon")
-        check_dynamics(distilling, PlannerConfig(value_at="turns"))
+        if distilling.horizon >= config.horizon:
+            raise UserError(f"the student's loss takes {distilling.horizon + 1} actions, the "
+                            f"expert's batches hold {config.horizon}; lower --distill-horizon or "
+                            f"raise --horizon")
     out = output_folder(args.out or f"runs/train-{args.task}-{args.seed}")
     training, checkpoint = Training(args, config, planning, distilling), out / "checkpoint.npz"
     if checkpoint.exists():
@@ -2833,14 +2790,14 @@ def command_evaluate(args):
     """evaluate: a model's returns on a task."""
     from_args(PlannerConfig, args)  # wrong settings first, then wrong files
     model, header = load_model(args.model)
-    planning = from_args(PlannerConfig, args, discount=trained_discount(header, args.model))
+    made_for = {"discount": trained_discount(header, args.model)}
+    if "distill" in header:
+        made_for["horizon"] = from_dict(DistillConfig, header["distill"], args.model).horizon
+    planning = from_args(PlannerConfig, args, **made_for)
     task = args.task or header.get("task")
     if args.record and task != header.get("task"):
         raise UserError(f"{args.model}: header: task: expected {task!r} to record its returns, "
                         f"found {header.get('task')!r}")
-    if "distill" in header:
-        check_dynamics(from_dict(DistillConfig, header["distill"], args.model),
-                       planning.settled(model))
     found = evaluate(model, task, planning, args.episodes, args.seed, args.workers)
     returns = found["returns"]
     result = {"return_mean": float(np.mean(returns)), "return_std": float(np.std(returns)),
@@ -2911,8 +2868,7 @@ def multiply_adds(config, planner):
     cost = {name: agents * sum(a * b for a, b in zip(widths, widths[1:]))
             for name, _, agents, widths in networks(config)}
     step, value = cost["_dynamics"] + cost["_reward"], cost["_Q1"] + cost["_Q2"]
-    rewards, values = planner.weights
-    return planner.samples * planner.iterations * (len(rewards) * step + len(values) * value)
+    return planner.samples * planner.iterations * (planner.horizon * step + value)
 
 
 def benchmark_prediction(robot, workers, runs):
@@ -2942,7 +2898,7 @@ def benchmark_decisions(robot, workers, planning, turns):
     ms_median, floor_ms, ratio_to_floor; and the microseconds of a hand-over to the workers."""
     _, n, *_ = ROBOTS[robot]
     obs = np.random.default_rng(0).standard_normal(ROBOTS[robot][0], F32)
-    budgets = [planning] + [dataclasses.replace(planning, elites=0, **{name: value})
+    budgets = [planning] + [dataclasses.replace(planning, **{name: value})
                             for name, value in (("samples", 128), ("iterations", 2))  # Figure 7
                             if getattr(planning, name) != value]
     presets = {"table2": ((50, 512), (50, max(512 // n, 50))),
@@ -3012,9 +2968,6 @@ def command_benchmark(args):
             raise UserError(f"unknown robot {robot!r}; known: {', '.join(ROBOTS)}")
     if args.runs < 10:
         raise UserError(f"runs must be at least 10, not {args.runs}")
-    if planning.value_at in ("auto", "turns"):
-        raise UserError(f"value_at must be after, last or both here, not {planning.value_at}: the "
-                        f"models plan alike, every decision")
     if args.figure:
         pyplot()  # before the work, not after it
     prediction, decision, hand_overs = [], [], []
@@ -3165,7 +3118,7 @@ def make_parser():
     sub.add_argument("--evaluate-expert", action="store_true",
                      help="measure the expert's return anew instead of reading its record")
     add_config(sub, DistillConfig)
-    add_config(sub, PlannerConfig, prefix="plan-")
+    add_config(sub, PlannerConfig, prefix="plan-", skip=("horizon",))
 
     sub = command("train", command_train, "Train an expert in NumPy (Equation 1); with --student "
                   "fac, distil it on the way (appendix C.1).",
@@ -3193,7 +3146,7 @@ def make_parser():
                      "evaluations on the way [4000]")
     sub.add_argument("--evaluate-episodes", type=natural, default=10, help="episodes in one [10]")
     add_config(sub, ExpertConfig, **TRAINING_DEFAULTS)
-    add_config(sub, PlannerConfig, "MPPI while training", "plan-", skip=("discount",),
+    add_config(sub, PlannerConfig, "MPPI while training", "plan-", skip=("discount", "horizon"),
                **TRAINING_BUDGET)
     add_config(sub, DistillConfig, "The student (Algorithm 1), on the expert's batches and steps",
                "distill-", skip=("steps", "batch_size", "new_targets", "own_episodes", "own_share",

@@ -187,7 +187,7 @@ class Learner:
 
         obs (E, O); mean (L, E, A) is the warm start. Returns actions (E, A) and the new mean.
         """
-        length, (rewards, values) = len(mean), planner.weights
+        length, horizon, gamma = len(mean), planner.horizon, planner.discount
         z0 = self.model.encode(obs)
         num_env, samples = len(obs), planner.samples
         pi_trajs, dim_action = planner.pi_trajs, mean.shape[-1]
@@ -204,14 +204,12 @@ class Learner:
             actions = (mean[:, :, None] + std[:, :, None] * noise).clamp(-1, 1)
             actions = torch.cat([actions, proposals], 2)
             flat, z, value = actions.flatten(1, 2), start, 0.0
-            for h in range(length):
-                if h in values:
-                    value = value + values[h] * sum(self.model.q(z, flat[h])) / 2
-                if h < len(rewards):
-                    z, r = self.model.next(z, flat[h])
-                    value = value + rewards[h] * r
+            for h in range(horizon):
+                z, r = self.model.next(z, flat[h])
+                value = value + gamma ** h * r
+            value = value + gamma ** horizon * sum(self.model.q(z, flat[horizon])) / 2
             value = value.view(num_env, -1).nan_to_num()
-            top, index = value.topk(planner.elites, 1)
+            top, index = value.topk(planner.num_elites, 1)
             elites = actions.gather(2, index[None, :, :, None].expand(
                 length, -1, -1, dim_action))
             score = torch.softmax(planner.temperature * top, 1)[None, :, :, None]
@@ -286,7 +284,7 @@ def train(args, config, planner):
             horizon = int(np.interp(decisions, [0, config.std_steps], [1, planner.horizon]))
             planning = dataclasses.replace(planner, horizon=horizon, discount=config.discount)
             warming = decisions < config.seed_decisions
-            mean = torch.zeros(planning.rewards + 1, args.envs, dim_action, device=args.device)
+            mean = torch.zeros(planning.horizon + 1, args.envs, dim_action, device=args.device)
             losses = []
             for step in range(fac.EPISODE_STEPS):
                 if warming:
@@ -469,19 +467,19 @@ def write_golden(folder, replay, config):
     found.update(obs=obs, action=action, rewards=reward)
 
     # one refinement of MPPI (Equation 2) with fixed noise
-    planner = fac.PlannerConfig(samples=64, elites=8, pi_trajs=0, horizon=3, value_at="after")
+    planner = fac.PlannerConfig(samples=64, elites=8, pi_trajs=0)
     dim_action = expert.config.dim_action
-    noise = rng.standard_normal((planner.rewards + 1, dim_action, planner.samples), np.float32)
-    mean = rng.uniform(-0.5, 0.5, (planner.rewards + 1, dim_action)).astype(np.float32)
+    noise = rng.standard_normal((planner.horizon + 1, dim_action, planner.samples), np.float32)
+    mean = rng.uniform(-0.5, 0.5, (planner.horizon + 1, dim_action)).astype(np.float32)
     actions = (torch.tensor(mean)[..., None] + planner.max_std * torch.tensor(noise)).clamp(-1, 1)
     actions = actions.double().transpose(1, 2)
     with torch.no_grad():
         z, value = model.encode(double[0][0, :1]).expand(planner.samples, -1), 0.0
-        for h in range(planner.rewards):
+        for h in range(planner.horizon):
             z_next, r = model.next(z, actions[h])
             value, z = value + planner.discount ** h * r, z_next
-        value = value + planner.discount ** planner.rewards * sum(model.q(z, actions[-1])) / 2
-        top, index = value.topk(planner.elites)
+        value = value + planner.discount ** planner.horizon * sum(model.q(z, actions[-1])) / 2
+        top, index = value.topk(planner.num_elites)
         score = torch.softmax(planner.temperature * top, 0)[None, :, None]
         refined = (score * actions[:, index]).sum(1)
         std = (score * (actions[:, index] - refined[:, None]) ** 2).sum(1).sqrt()

@@ -50,19 +50,19 @@ class TorchPlanner:
 
     def __init__(self, model, config):
         self.sizes, self.config, self.params = model.config, config, to_torch(model)
-        self.mean = torch.zeros(self.sizes.num_agents, config.rewards + 1, 1,
+        self.mean = torch.zeros(self.sizes.num_agents, config.horizon + 1, 1,
                                 self.sizes.agent_actions)
 
     def returns(self, z, actions):
         """Equation 2: z (N, S, m), actions (N, L, S, d) -> (N, S)."""
         total, config, p = 0.0, self.config, self.params
-        for h in range(config.rewards):
+        for h in range(config.horizon):
             x = torch.cat([z, actions[:, h]], -1)
             total = total + config.discount ** h * run_network(fac.MLP, p, "_reward", x)[..., 0]
             z = run_network(fac.MLP, p, "_dynamics", x)
         x = torch.cat([z, actions[:, -1]], -1)
         q = run_network(fac.QNET, p, "_Q1", x) + run_network(fac.QNET, p, "_Q2", x)
-        return total + config.discount ** config.rewards * q[..., 0] / 2
+        return total + config.discount ** config.horizon * q[..., 0] / 2
 
     @torch.inference_mode()
     def act(self, obs):
@@ -72,9 +72,9 @@ class TorchPlanner:
         z = z.view(n, 1, -1).expand(-1, config.samples, -1)
         mean, std = self.mean, torch.tensor(config.max_std)
         for _ in range(config.iterations):
-            noise = torch.randn(n, config.rewards + 1, config.samples, self.sizes.agent_actions)
+            noise = torch.randn(n, config.horizon + 1, config.samples, self.sizes.agent_actions)
             actions = (mean + std * noise).clamp(-1, 1)
-            top, index = self.returns(z, actions).topk(config.elites, 1)
+            top, index = self.returns(z, actions).topk(config.num_elites, 1)
             elites = actions.gather(2, index[:, None, :, None].expand(-1, *actions.shape[1:2], -1,
                                                                       actions.shape[-1]))
             score = torch.softmax(config.temperature * top, 1)[:, None, :, None]
@@ -113,7 +113,7 @@ def ratios(ours, theirs, turns):
 
 def planning(n, dim_action, turns, compiled=False):
     """(ratio, our ms, PyTorch's ms) of one decision, one thread each."""
-    model, config = make_model(n, dim_action), fac.PlannerConfig(horizon=3, value_at="after")
+    model, config = make_model(n, dim_action), fac.PlannerConfig()
     obs = np.random.default_rng(1).standard_normal(24).astype(np.float32)
     theirs = TorchPlanner(model, config)
     z, actions = torch.randn(n, 7, model.config.latent_dim), torch.rand(n, 4, 7, dim_action // n)
@@ -217,8 +217,8 @@ def training(threads, turns, batch=256):
     their_batch = [torch.tensor(x) for x in (obs.swapaxes(1, 2), actions.swapaxes(1, 2), reward)]
     torch.set_num_threads(threads)
     with fac._thread_pools().limit(limits=threads, user_api="blas"):
-        return ratios(lambda: ours.update(obs, actions, reward, 0.1, rng),
-                      lambda: theirs.update(*their_batch, 0.1), turns)
+        return ratios(lambda: ours.update(obs, actions, reward, rng),
+                      lambda: theirs.update(*their_batch), turns)
 
 
 def main():

@@ -162,7 +162,8 @@ def test_every_setting_has_a_flag_in_help():
                                           ("benchmark", fac.PlannerConfig, "")):
         text = subparsers[command].format_help()
         for f in dataclasses.fields(config_class):
-            assert f"--{prefix}{f.name}".replace("_", "-") in text
+            name = f.name if f.name == "horizon" else prefix + f.name
+            assert f"--{name}".replace("_", "-") in text
 
 
 # configuration ------------------------------------------------------------------------
@@ -190,21 +191,21 @@ def configs_of(monkeypatch, *arguments):
 def test_default_settings_are_those_of_the_dataclasses(monkeypatch):
     assert configs_of(monkeypatch, "distill") == (fac.DistillConfig(), fac.PlannerConfig())
     assert configs_of(monkeypatch, "evaluate", "--model", "x") == (fac.PlannerConfig(),)
-    assert configs_of(monkeypatch, "benchmark") == (fac.PlannerConfig(horizon=3, value_at="after"),)
+    assert configs_of(monkeypatch, "benchmark") == (fac.PlannerConfig(),)
 
 
 def test_preset_paper_is_the_paper(monkeypatch):
     config, planner = configs_of(monkeypatch, "distill", "--preset", "paper")
     found = dataclasses.asdict(config)
     expected = {"steps": 100_000, "batch_size": 512, "noise_samples": 10, "horizon": 3,
-                "final_term": True, "lam": 0.5, "reward_coef": 0.5, "value_coef": 0.1,
+                "lam": 0.5, "reward_coef": 0.5, "value_coef": 0.1,
                 "kl": "reverse", "encoder_input": "observation", "lr": 1e-4,
                 "lr_schedule": "constant", "warmup": 0, "grad_clip": 10, "sizes": "table2",
                 "noise_std": 0.5, "noise_std_min": 0.5, "clip_actions": False, "new_targets": 0,
                 "own_episodes": 0, "own_share": 0}
     assert {k: found[k] for k in expected} == expected
-    assert (planner.samples, planner.iterations, planner.elites, planner.pi_trajs, planner.horizon,
-            planner.discount, planner.value_at) == (512, 6, 64, 24, 3, 0.99, "after")
+    assert (planner.samples, planner.iterations, planner.num_elites, planner.pi_trajs,
+            planner.horizon, planner.discount) == (512, 6, 64, 24, 3, 0.99)
 
 
 def test_flags_go_before_the_preset(monkeypatch):
@@ -230,6 +231,8 @@ def another_value(f):
     (fac.PlannerConfig, "", ["evaluate", "--model", "x"])])
 def test_every_flag_reaches_its_setting(monkeypatch, config_class, prefix, start):
     for f in dataclasses.fields(config_class):
+        if prefix and f.name == "horizon":
+            continue  # distill has one H
         (flag, *rest), value = another_value(f)
         flag = f"--no-{prefix}{flag[3:]}" if flag.startswith("no-") else f"--{prefix}{flag}"
         found = next(c for c in configs_of(monkeypatch, *start, flag, *rest)
@@ -268,12 +271,8 @@ def refused(done, *parts):
     (["--num-agents", "-3"], ["agents", "[1, 3]", "-3"]),
     (["--steps", "0"], ["steps", "at least 1", "0"]),
     (["--batch-size", "0"], ["batch_size", "at least 1"]),
-    (["--horizon", "0"], ["horizon", "at least 1"]),
+    (["--horizon", "-1"], ["horizon", "at least 0"]),
     (["--horizon", "500"], ["horizon", "below an episode's 500"]),
-    (["--horizon", "501", "--no-final-term"], ["horizon", "at most an episode's 500"]),
-    (["--no-final-term"], ["no dynamics", "--plan-value-at last"]),
-    (["--no-final-term", "--plan-value-at", "last", "--plan-horizon", "2"],
-     ["no dynamics", "--plan-horizon 1"]),
     (["--noise-samples", "1"], ["noise_samples", "at least 2"]),
     (["--noise-std", "nan"], ["noise_std", "nan"]),
     (["--noise-std", "inf"], ["noise_std", "finite"]),
@@ -285,7 +284,7 @@ def refused(done, *parts):
     (["--kl", "sideways"], ["--kl", "'sideways'", "forward"]),
     (["--preset", "authors"], ["--preset", "'authors'", "paper"]),
     (["--plan-elites", "17"], ["17 elites", "16 samples"]),
-    (["--plan-horizon", "0"], ["horizon", "at least 1"]),
+    (["--plan-horizon", "0"], ["--plan-horizon"]),
     (["--plan-samples", "0"], ["samples", "at least 1"]),
     (["--plan-pi-trajs", "-1"], ["pi_trajs", "-1"]),
     (["--plan-min-std", "3"], ["min_std", "max_std"]),
@@ -336,8 +335,6 @@ def test_what_diverges_is_refused_and_leaves_no_weights(tmp_path, files, steps):
     (["evaluate"], ["--model"]),
     (["benchmark", "--robots", "reecher"], ["'reecher'", *fac.ROBOTS]),
     (["benchmark", "--runs", "9"], ["runs", "at least 10"]),
-    (["benchmark", "--value-at", "auto"], ["value_at", "after, last or both"]),
-    (["benchmark", "--value-at", "turns"], ["value_at", "after, last or both", "turns"]),
     (["benchmark", "--workers", "-1"], ["--workers", "-1"]),
     (["benchmark", "--elites", "600"], ["600 elites", "512 samples"]),
     (["evaluate", "--model", "none.npz"], ["none.npz", "no such file"]),
@@ -453,9 +450,8 @@ def test_distill_prints_json_and_a_table(distilled):
     table = done.stdout
     assert "expert (measured now)" in table and "student, N = 3" in table and "±" in table
     assert f"{result['speedup']:.1f}" in table and "speed-up" in table
-    assert "value_at after (expert), turns (student)" in table
-    own = result["plan_ms_expert_own"]
-    assert f"{own:.1f}" in table and "expert, planning like its student" in table
+    assert "16 samples, 1 iterations, horizon 1" in table
+    assert result["plan_ms_expert_own"] == result["plan_ms_expert"]
 
 
 def test_distill_shows_its_progress(distilled):
@@ -705,20 +701,17 @@ def test_recorded_returns_stand_for_the_expert_in_distill(tmp_path, files, no_pl
     assert labels == ["evaluating the student", "evaluating the expert"]
 
 
-def test_a_student_without_dynamics_plans_without_them(tmp_path, files, monkeypatch, capsys):
-    monkeypatch.setattr(fac, "evaluate", lambda *_: {"returns": [1.0], "plan_ms_median": 1.0})
+def test_a_student_plans_over_the_horizon_it_was_distilled_over(tmp_path, files, monkeypatch):
+    """And its expert beside it; a flag of `evaluate` goes before."""
+    seen = []
+    monkeypatch.setattr(fac, "evaluate", lambda model, task, planning, *_: (
+        seen.append(planning.horizon), {"returns": [1.0], "plan_ms_median": 1.0})[1])
     monkeypatch.setattr(fac, "draw_curve", lambda *_: True)
-    arguments = distill_arguments(files, "--no-final-term", "--plan-value-at", "last", "--json",
-                                  "--out", tmp_path)
+    arguments = distill_arguments(files, "--horizon", "2", "--out", tmp_path)
     assert fac.main([str(a) for a in arguments]) == 0
-    table, result = capsys.readouterr().out.strip().rsplit("\n", 1)
-    result = json.loads(result)
-    assert result["plan_ms_expert_own"] == result["plan_ms_expert"]  # the same planning, one figure
-    assert "planning like its student" not in table
-    evaluate = ["evaluate", "--model", str(tmp_path / "student.npz")]
-    assert fac.main([*evaluate, "--value-at", "last"]) == 0
-    assert fac.main(evaluate) == 2
-    assert "no dynamics" in capsys.readouterr().err.splitlines()[-1]
+    evaluation = ["evaluate", "--model", str(tmp_path / "student.npz")]
+    assert fac.main(evaluation) == fac.main([*evaluation, "--horizon", "0"]) == 0
+    assert seen == [2, 2, 2, 0]
 
 
 @pytest.mark.parametrize("config, seeds, expected", [
@@ -786,11 +779,11 @@ def test_train_expert_in_stretches(tmp_path, capsys):
     assert train(499) == 2 and "--decisions 499" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
     assert train(500) == 0
-    assert train(1000, "--plan-value-at", "last", "--plan-horizon", "1") == 0
+    assert train(1000, "--plan-horizon", "0") == 0
     assert len((tmp_path / "run" / "curve.csv").read_text().splitlines()) == 3
     expert, header = fac.load_model(tmp_path / "walker-walk" / "expert.npz")
     assert expert.has_policy and (header["decisions"], header["updates"]) == (1000, 100)
-    assert header["training_planner"]["value_at"] == "last"
+    assert header["training_planner"]["horizon"] == 0
     assert fac.Replay(tmp_path / "walker-walk" / "replay.npz").transitions == 1000
     assert (tmp_path / "walker-walk" / "golden.npz").exists()
     assert train(1500, "--lr", "1e-3") == 2

@@ -310,7 +310,7 @@ def test_sizes_in_the_header_must_be_those_of_the_weights(expert_file):
 
 @pytest.mark.parametrize("config", [
     fac.PlannerConfig(samples=40, min_std=0.1, output="mean"),
-    fac.DistillConfig(steps=3, final_term=False, kl="reverse"),
+    fac.DistillConfig(steps=3, kl="reverse"),
     fac.ModelConfig(8, 3, 3, expert_latent_dim=6), fac.ExpertConfig(lr=1e-3)])
 def test_a_config_survives_json(config):
     values = json.loads(json.dumps(vars(config)))

@@ -103,12 +103,6 @@ def test_an_episode_may_get_new_weights_on_its_way():
     assert np.array_equal(newer[:5], whole[:5]) and not np.allclose(newer[5:], whole[5:])
 
 
-def test_parts_of_an_episode_don_t_begin_the_turns_anew():
-    parts = [(0, fac.TURN), (0, 2)]  # the second with another return
-    whole = play([(0, fac.TURN + 2)], policy=False)
-    assert np.array_equal(play(parts, policy=False), whole)
-
-
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A finished run: (its process, its folder)."""
@@ -191,8 +185,7 @@ def test_a_killed_run_goes_on_to_the_same_result(trained, tmp_path):
     (["--lr", "inf"], ["lr", "finite"]),
     (["--updates-per-step", "nan"], ["updates_per_step", "nan"]),
     (["--mlp-dim", "0"], ["mlp_dim", "at least 1"]),
-    (["--distill-horizon", "3"], ["4 steps", "hold 3"]),
-    (["--no-distill-final-term"], ["no dynamics", "final term"]),
+    (["--distill-horizon", "3"], ["4 actions", "hold 3"]),
     (["--num-agents", "2"], ["[1, 3]"]),
     (["--num-agents", "0"], ["[1, 3]"]),
     (["--horizon", "501"], ["horizon", "500"]),
