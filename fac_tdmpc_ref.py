@@ -10,7 +10,6 @@ the same Equation 1 in PyTorch (data/train_expert.py), which the golden tests co
 
     python fac_tdmpc_ref.py distill --task reacher-hard
     python fac_tdmpc_ref.py evaluate --model runs/reacher-hard-0/student.npz
-    python fac_tdmpc_ref.py benchmark
     python fac_tdmpc_ref.py train --task reacher-easy --student fac
 
 The one idea that keeps it small: every model carries an agent axis N, and a centralized model is
@@ -2061,22 +2060,23 @@ def progress(label, total, unit, initial=0):
                 mininterval=0.5 if sys.stderr.isatty() else 20)
 
 
-def take_turns(runs, turns, label):
-    """Seconds of functions that are called in turn, (turns, runs), so that noise hits all alike.
+def interleaved_seconds(calls, rounds, label):
+    """Seconds of functions that are called one after the other, again and again: (rounds, calls).
 
-    BLAS has one thread meanwhile: idle ones would keep a core from the worker processes. Also the
-    seconds of one multiply-add in a product of 512 x 512 matrices, (turns,).
+    So noise hits all alike. BLAS has one thread meanwhile: idle ones would keep a core from the
+    worker processes. A round before the first makes buffers and isn't counted.
     """
-    matrix, seconds = np.ones((512, 512), F32), np.zeros((turns, len(runs) + 1))
-    runs = [lambda: matrix @ matrix, *runs]
-    with one_thread(), progress(label, turns, "turn") as bar:
-        for turn in range(-1, turns):  # one more, which makes buffers
-            for i, run in enumerate(runs):
+    seconds = np.zeros((rounds, len(calls)))
+    with one_thread(), progress(label, rounds, "round") as bar:
+        for call in calls:
+            call()
+        for row in seconds:
+            for i, call in enumerate(calls):
                 begin = time.perf_counter()
-                run()
-                seconds[turn, i] = time.perf_counter() - begin
-            bar.update(turn >= 0)
-    return seconds[:, 1:], seconds[:, 0] / 512 ** 3
+                call()
+                row[i] = time.perf_counter() - begin
+            bar.update()
+    return seconds
 
 
 CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correlation_h0",
@@ -2334,7 +2334,8 @@ def time_both(expert, student, planning, obs, beside, keep):
     with contextlib.ExitStack() as stack:
         planners = [stack.enter_context(Planner(model, planning, workers=workers))
                     for model, workers in ((expert, 0), (student, 0), (student, beside))]
-        seconds, _ = take_turns([functools.partial(p.act, obs) for p in planners], 20, "timing")
+        seconds = interleaved_seconds([functools.partial(p.act, obs) for p in planners], 20,
+                                      "timing")
     central, alone, parallel = (float(ms) for ms in 1e3 * np.median(seconds, 0))
     if not beside or (not keep and parallel >= alone):
         beside, parallel = 0, alone
@@ -2812,229 +2813,6 @@ def command_evaluate(args):
     return result
 
 
-# robot: dim O, dim A (Figure 3), milliseconds of f_T, f_R, f_Q in TD-MPC and in Fac-TDMPC (Table 3)
-ROBOTS = {
-    "reacher": (8, 3, (5.83, 5.32, 11.73), (1.25, 1.02, 2.56)),
-    "hopper": (15, 4, (5.86, 5.34, 11.70), (0.83, 0.65, 1.71)),
-    "fish": (24, 5, (5.83, 5.26, 11.56), (0.77, 0.57, 1.53)),
-    "cheetah": (17, 6, (5.63, 5.06, 11.35), (0.75, 0.49, 1.34)),
-    "walker": (24, 6, (5.86, 5.28, 11.71), (0.72, 0.48, 1.32)),
-    "quadruped": (78, 12, (5.96, 5.34, 11.86), (0.63, 0.49, 0.96)),
-    "humanoid": (67, 21, (5.83, 5.25, 11.71), (0.42, 0.32, 0.69)),
-}
-FUNCTIONS = {"f_T": ("_dynamics",), "f_R": ("_reward",), "f_Q": ("_Q1", "_Q2")}
-TABLE3_BATCH = 512
-MODES = ("one-thread", "processes", "critical-path")
-
-
-class Predictor:
-    """f_T, f_R and f_Q alone, on fixed inputs in kept buffers: predictor("f_T").
-
-    workers: processes beside this one that share the agents; their inputs are there already.
-    """
-
-    def __init__(self, model, workers=0):
-        mine, *theirs = shares(model.config.num_agents, workers)
-        self.model, self._arena = model.agents(mine.start, mine.stop), Arena()
-        sizes = self.model.config
-        self._x = np.random.default_rng(0).standard_normal(
-            (sizes.num_agents, sizes.latent_dim + sizes.agent_actions, TABLE3_BATCH), F32)
-        self._workers = Workers(_prediction_worker, workers, "prediction worker")
-        for i, share in enumerate(theirs):
-            self._workers.send(i, model.agents(share.start, share.stop))
-
-    def __call__(self, function):
-        self._workers.send_all(function)
-        self._arena.rewind()
-        for name in FUNCTIONS[function]:
-            forward(QNET if function == "f_Q" else MLP, self.model.params, name, self._x,
-                    empty=self._arena.empty)
-        self._workers.receive_all()
-
-    def close(self):
-        """End the worker processes."""
-        self._workers.close()
-
-
-def _prediction_worker(connection):
-    predict, done = Predictor(connection.recv()), pickle.dumps(None)
-    while True:
-        predict(connection.recv())
-        connection.send_bytes(done)
-
-
-def multiply_adds(config, planner):
-    """Multiply-adds of a decision's networks, as Equation 2 reads (none saved)."""
-    cost = {name: agents * sum(a * b for a, b in zip(widths, widths[1:]))
-            for name, _, agents, widths in networks(config)}
-    step, value = cost["_dynamics"] + cost["_reward"], cost["_Q1"] + cost["_Q2"]
-    return planner.samples * planner.iterations * (planner.horizon * step + value)
-
-
-def benchmark_prediction(robot, workers, runs):
-    """Table 3 for one robot: rows of robot, model, function, mode, ms_mean, ms_std."""
-    _, n, *_ = ROBOTS[robot]
-    factored = random_model(robot, n, 512 // n, 512 // n)
-    with contextlib.ExitStack() as stack:
-        def predictor(*args):
-            return stack.enter_context(contextlib.closing(Predictor(*args)))
-
-        subjects = [("TD-MPC", "one-thread", predictor(random_model(robot, 1, 512, 512))),
-                    ("10% TD-MPC", "one-thread", predictor(random_model(robot, 1, 512, 66))),
-                    ("TAP", "one-thread", predictor(random_model(robot, 1, 512, 512, 2))),
-                    ("Fac-TDMPC", "one-thread", predictor(factored)),
-                    ("Fac-TDMPC", "processes", predictor(factored, workers)),
-                    ("Fac-TDMPC", "critical-path", predictor(factored.agents(0, 1)))]
-        calls = [(model, mode, f, functools.partial(predict, f))
-                 for model, mode, predict in subjects for f in FUNCTIONS]
-        seconds, _ = take_turns([call[-1] for call in calls], runs, f"{robot}: networks")
-    return [{"robot": robot, "model": model, "function": f, "mode": mode,
-             "ms_mean": 1e3 * float(s.mean()), "ms_std": 1e3 * float(s.std())}
-            for (model, mode, f, _), s in zip(calls, seconds.T)]
-
-
-def benchmark_decisions(robot, workers, planning, turns):
-    """Whole decisions for one robot: rows of robot, model, preset, mode, samples, iterations,
-    ms_median, floor_ms, ratio_to_floor; and the microseconds of a hand-over to the workers."""
-    _, n, *_ = ROBOTS[robot]
-    obs = np.random.default_rng(0).standard_normal(ROBOTS[robot][0], F32)
-    budgets = [planning] + [dataclasses.replace(planning, **{name: value})
-                            for name, value in (("samples", 128), ("iterations", 2))  # Figure 7
-                            if getattr(planning, name) != value]
-    presets = {"table2": ((50, 512), (50, max(512 // n, 50))),
-               "section51": ((512, 512), (512 // n, 512 // n))}
-    subjects = []
-    with contextlib.ExitStack() as stack:
-        def planner(model, config, workers=0):
-            return stack.enter_context(Planner(model, config, workers=workers))
-
-        for preset, (central, factored) in presets.items():
-            central, factored = random_model(robot, 1, *central), random_model(robot, n, *factored)
-            for config in budgets:
-                parallel = planner(factored, config, workers)
-                subjects += [
-                    ("TD-MPC", preset, "one-thread", central, config, planner(central, config).act),
-                    ("Fac-TDMPC", preset, "one-thread", factored, config,
-                     planner(factored, config).act),
-                    ("Fac-TDMPC", preset, "processes", factored, config, parallel.act),
-                    ("Fac-TDMPC", preset, "critical-path", factored.agents(0, 1), config,
-                     one_agent(factored, config))]
-        seconds, gemm = take_turns([functools.partial(subject[-1], obs) for subject in subjects],
-                                   turns, f"{robot}: decisions")
-        hand_over, _ = take_turns([parallel.hand_over], 200, f"{robot}: hand-over")
-    rows = []
-    for (model, preset, mode, measured, config, _), s in zip(subjects, seconds.T):
-        ms = 1e3 * float(np.median(s))
-        floor = 1e3 * float(np.median(gemm)) * multiply_adds(measured.config, config)
-        rows.append({"robot": robot, "model": model, "preset": preset, "mode": mode,
-                     "samples": config.samples, "iterations": config.iterations,
-                     "ms_median": ms, "floor_ms": floor, "ratio_to_floor": ms / floor})
-    return rows, 1e6 * float(np.median(hand_over)) if workers else None
-
-
-def one_agent(model, config):
-    """A decision's critical path: the encoder, then the plan of one agent (all are of one size)."""
-    alone = AgentPlanner(model.agents(0, 1), config)
-    alone.reset(np.random.SeedSequence(0).spawn(1))
-    return lambda obs: alone.plan(model.encode(obs[:, None])[:1])
-
-
-def random_model(robot, num_agents, latent_dim, mlp_dim, dim_action=None):
-    """A model of a robot's dimensions with fresh weights."""
-    dim_obs, actions, *_ = ROBOTS[robot]
-    return WorldModel.create(ModelConfig(dim_obs, dim_action or actions, num_agents, latent_dim,
-                                         256, mlp_dim), np.random.default_rng(0))
-
-
-def speedups(prediction, decision, planning):
-    """TD-MPC's time over Fac-TDMPC's: rows of robot, function, mode, value, paper (Table 3)."""
-    ms = {(r["robot"], r["function"], r["model"], r["mode"]): r["ms_mean"] for r in prediction}
-    ms.update({(r["robot"], "decision", r["model"], r["mode"]): r["ms_median"] for r in decision
-               if (r["preset"], r["samples"], r["iterations"]) ==
-               ("section51", planning.samples, planning.iterations)})
-    paper = {(robot, f): central / factored for robot, (_, _, *times) in ROBOTS.items()
-             for f, central, factored in zip(FUNCTIONS, *times)}
-    return [{"robot": robot, "function": f, "mode": mode,
-             "value": value / ms[robot, f, "Fac-TDMPC", mode], "paper": paper.get((robot, f))}
-            for (robot, f, model, _), value in ms.items() if model == "TD-MPC" for mode in MODES]
-
-
-def command_benchmark(args):
-    """benchmark: Table 3 and whole decisions on this machine."""
-    planning = from_args(PlannerConfig, args, **paper_preset(PlannerConfig))
-    args.robots = list(dict.fromkeys(args.robots))
-    for robot in args.robots:
-        if robot not in ROBOTS:
-            raise UserError(f"unknown robot {robot!r}; known: {', '.join(ROBOTS)}")
-    if args.runs < 10:
-        raise UserError(f"runs must be at least 10, not {args.runs}")
-    if args.figure:
-        pyplot()  # before the work, not after it
-    prediction, decision, hand_overs = [], [], []
-    for robot in args.robots:
-        agents = ROBOTS[robot][1]
-        workers = (useful_workers(agents) if args.workers is None
-                   else min(args.workers, agents - 1))
-        prediction += benchmark_prediction(robot, workers, args.runs)
-        rows, hand_over = benchmark_decisions(robot, workers, planning, args.runs // 10)
-        decision += rows
-        hand_overs += [hand_over] * (hand_over is not None)
-    result = {"prediction": prediction, "decision": decision,
-              "speedup": speedups(prediction, decision, planning),
-              "handover_us": float(np.median(hand_overs)) if hand_overs else None,
-              "cores": cores()}
-    print_benchmark(result, args.robots)
-    if args.figure:
-        draw_prediction(args.figure, prediction, args.robots)
-    return result
-
-
-def print_benchmark(result, robots):
-    """Table 3, the speed-ups beside the paper's, and the decisions."""
-    times = {(r["robot"], r["function"], r["model"], r["mode"]):
-             f"{r['ms_mean']:.2f} ± {r['ms_std']:.2f}" for r in result["prediction"]}
-    ratio = {(r["robot"], r["function"], r["mode"]): r for r in result["speedup"]}
-    columns = [(m, "one-thread") for m in ("TD-MPC", "10% TD-MPC", "TAP", "Fac-TDMPC")]
-    columns += [("Fac-TDMPC", mode) for mode in MODES[1:]]
-    print(f"\nPrediction, ms, batch {TABLE3_BATCH}, mean ± sd; x: TD-MPC's time over Fac-TDMPC's, "
-          f"one thread / processes / one agent alone (paper: N threads)\n")
-    print_table([("", "", *(m if mode == "one-thread" else mode for m, mode in columns), "x",
-                  "paper's x")] + [
-        (robot, f, *(times[(robot, f, *column)] for column in columns),
-         " / ".join(f"{ratio[robot, f, mode]['value']:.1f}" for mode in MODES),
-         f"{ratio[robot, f, 'one-thread']['paper']:.1f}") for robot in robots for f in FUNCTIONS])
-    print("\nOne decision, ms, median (times the GEMM floor)\n")
-    rows = {}
-    for r in result["decision"]:
-        key = r["robot"], r["preset"], f"{r['samples']} x {r['iterations']}"
-        rows.setdefault(key, []).append((r["ms_median"], r["ratio_to_floor"]))
-    print_table([("", "sizes", "budget", "TD-MPC", "Fac-TDMPC", *MODES[1:], "x")] + [
-        (*key, *(f"{ms:.2f} ({times_floor:.2f})" for ms, times_floor in cells),
-         " / ".join(f"{cells[0][0] / ms:.1f}" for ms, _ in cells[1:]))
-        for key, cells in rows.items()])
-    us = result["handover_us"]
-    print("\nno workers" if us is None else f"\na hand-over to the workers and back: {us:.0f} us",
-          f"{result['cores']} cores", sep="; ")
-
-
-def draw_prediction(path, prediction, robots):
-    """Figure 6: prediction times as bars, logarithmic."""
-    plt = pyplot()
-    subjects = list(dict.fromkeys((r["model"], r["mode"]) for r in prediction))
-    figure, axes = plt.subplots(3, 1, figsize=(10, 8), layout="constrained", sharex=True)
-    for ax, function in zip(axes, FUNCTIONS):
-        for i, (model, mode) in enumerate(subjects):
-            rows = [r for r in prediction if (r["function"], r["model"], r["mode"]) ==
-                    (function, model, mode)]
-            ax.bar(np.arange(len(robots)) + (i - 2.5) * 0.14, [r["ms_mean"] for r in rows], 0.13,
-                   yerr=[r["ms_std"] for r in rows], label=f"{model}, {mode}")
-        ax.set(yscale="log", ylabel=f"${function}$, ms")
-        ax.grid(axis="y", alpha=0.3)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
-    axes[-1].set_xticks(range(len(robots)), [f"{r}\nN = {ROBOTS[r][1]}" for r in robots])
-    save_figure(path, figure)
-
-
 def add_config(parser, config_class, title=None, prefix="", skip=(), **defaults):
     """A flag for every field of a config but `skip`; `--help` shows default and paper value."""
     group = parser.add_argument_group(title or config_class.__doc__.split(".")[0])
@@ -3076,6 +2854,15 @@ def natural(text):
     return int(text)
 
 
+def add_command(commands, name, run, help, **extra):
+    """A sub-command with --json, which every one has."""
+    sub = commands.add_parser(name, help=help, description=help, **extra)
+    sub.set_defaults(run=run)
+    sub.add_argument("--json", action="store_true",
+                     help="print one JSON object as the last line of stdout")
+    return sub
+
+
 class Parser(argparse.ArgumentParser):
     def error(self, message):
         self.exit(2, f"{self.prog}: error: {message} (try --help)\n")
@@ -3088,16 +2875,9 @@ def make_parser():
                     "parallel.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def command(name, run, help, **extra):
-        sub = commands.add_parser(name, help=help, description=help, **extra)
-        sub.set_defaults(run=run)
-        sub.add_argument("--json", action="store_true",
-                         help="print one JSON object as the last line of stdout")
-        return sub
-
-    sub = command("distill", command_distill, "Distil a task's expert into a factored student "
-                  "(Algorithm 1), then evaluate and time both with MPPI.",
-                  epilog="A run that was cut off goes on when the same command is given again.")
+    sub = add_command(commands, "distill", command_distill, "Distil a task's expert into a "
+                      "factored student (Algorithm 1), then evaluate and time both with MPPI.",
+                      epilog="A run that was cut off goes on when the same command is given again.")
     sub.add_argument("--task", default="reacher-hard", help="one of: " + ", ".join(TASKS))
     sub.add_argument("--seed", type=natural, default=0, help="of distillation [0]")
     sub.add_argument("--num-agents", type=int, help="N, a divisor of dim(A) [dim(A)]")
@@ -3120,8 +2900,8 @@ def make_parser():
     add_config(sub, DistillConfig)
     add_config(sub, PlannerConfig, prefix="plan-", skip=("horizon",))
 
-    sub = command("train", command_train, "Train an expert in NumPy (Equation 1); with --student "
-                  "fac, distil it on the way (appendix C.1).",
+    sub = add_command(commands, "train", command_train, "Train an expert in NumPy (Equation 1); "
+                      "with --student fac, distil it on the way (appendix C.1).",
                   epilog="A run that was cut off goes on when the same command is given again. Its "
                   "folder is what distill takes as --expert.")
     sub.add_argument("--task", default="reacher-easy", help="one of: " + ", ".join(TASKS))
@@ -3153,8 +2933,8 @@ def make_parser():
                                 "held_out"),
                **FOLLOWING_DEFAULTS)
 
-    sub = command("evaluate", command_evaluate, "Plan with a model (expert or student) through "
-                  "whole episodes.")
+    sub = add_command(commands, "evaluate", command_evaluate, "Plan with a model (expert or "
+                      "student) through whole episodes.")
     sub.add_argument("--model", required=True, help="an expert.npz or student.npz")
     sub.add_argument("--task", help="one of: " + ", ".join(TASKS) + " [the model's own]")
     sub.add_argument("--episodes", type=int, default=20, help="[20]")
@@ -3164,39 +2944,29 @@ def make_parser():
     sub.add_argument("--record", action="store_true",
                      help="write the returns into the model's header, where distill finds them")
     add_config(sub, PlannerConfig)
-
-    sub = command("benchmark", command_benchmark, "Planning speed: Table 3 (the networks) and "
-                  "whole decisions, centralized and factored, by threads and processes.",
-                  epilog="Fresh weights: speed doesn't depend on what a model has learned. Keep "
-                  "the machine quiet, and read ratios.")
-    sub.add_argument("--robots", nargs="+", default=list(ROBOTS), metavar="ROBOT",
-                     help="some of: " + ", ".join(ROBOTS) + " [all]")
-    sub.add_argument("--workers", type=natural, help="processes beside this one, at most "
-                     "one for each further agent [as many as there are cores for]")
-    sub.add_argument("--runs", type=int, default=100, help="of each network; decisions are timed a "
-                     "tenth as often [100]")
-    sub.add_argument("--figure", help="draw Figure 6 into this file")
-    add_config(sub, PlannerConfig, **paper_preset(PlannerConfig))
     return parser
 
 
-def main(argv=None):
-    """Run the command line; returns the exit status."""
-    args = make_parser().parse_args(argv)
+def run_command(parser, argv=None):
+    """Run a command line; returns the exit status: 2, with one line, for what the user can mend."""
+    args = parser.parse_args(argv)
     try:
         result = args.run(args)
     except (UserError, MemoryError) as error:
-        print(f"fac_tdmpc_ref.py: error: {str(error) or 'not enough memory'}", file=sys.stderr)
+        print(f"{parser.prog}: error: {str(error) or 'not enough memory'}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("fac_tdmpc_ref.py: interrupted" + (
-            "; the same command goes on from its last checkpoint"
-            * (args.command in ("distill", "train"))),
-            file=sys.stderr)
+        print(f"{parser.prog}: interrupted; the same command goes on from its last checkpoint, "
+              f"if it had one", file=sys.stderr)
         return 130
     if args.json:
         print(json.dumps(result))
     return 0
+
+
+def main(argv=None):
+    """Run the command line of this module; returns the exit status."""
+    return run_command(make_parser(), argv)
 
 
 if __name__ == "__main__":

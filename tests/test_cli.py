@@ -27,6 +27,7 @@ TINY = ["--steps", str(STEPS), "--batch-size", "4", "--horizon", "1", "--held-ou
         "--plan-iterations", "1"]
 # BLAS threads that wait for a busy core make runs many times longer
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+BLOCKED = "raise ImportError('blocked by a test')\n"
 KEYS = {"task", "seed", "steps", "seconds", "expert_return_mean", "expert_return_std",
         "student_return_mean", "student_return_std", "episodes", "kl_reward", "kl_value",
         "rank_correlation", "plan_ms_expert", "plan_ms_student", "speedup", "expert_recorded",
@@ -69,7 +70,7 @@ def files(tmp_path_factory):
 def no_plots(tmp_path_factory):
     """Settings under which matplotlib can't be imported; runs end sooner without it, too."""
     folder = tmp_path_factory.mktemp("blocked")
-    (folder / "matplotlib.py").write_text("raise ImportError('blocked by a test')\n")
+    (folder / "matplotlib.py").write_text(BLOCKED)
     return {"PYTHONPATH": str(folder), **ONE_THREAD}
 
 
@@ -138,8 +139,7 @@ except SystemExit as end:
 
 
 @pytest.mark.parametrize("command, expected", [
-    ((), ["distill", "evaluate", "benchmark"]),
-    (("benchmark",), ["--robots", "humanoid", "--figure", "--iterations", "[3; paper: 3]"]),
+    ((), ["distill", "evaluate"]),
     (("distill",), ["--task", "--preset", "--num-agents", "--evaluate-expert", "--plan-samples",
                     "[20000; paper: 100000]", "[forward; paper: reverse]", "reacher-hard"]),
     (("train",), ["--student", "--plan-samples", "(Table 2) [128; paper: 512]",
@@ -158,8 +158,7 @@ def test_every_setting_has_a_flag_in_help():
     subparsers = fac.make_parser()._subparsers._group_actions[0].choices
     for command, config_class, prefix in (("distill", fac.DistillConfig, ""),
                                           ("distill", fac.PlannerConfig, "plan-"),
-                                          ("evaluate", fac.PlannerConfig, ""),
-                                          ("benchmark", fac.PlannerConfig, "")):
+                                          ("evaluate", fac.PlannerConfig, "")):
         text = subparsers[command].format_help()
         for f in dataclasses.fields(config_class):
             name = f.name if f.name == "horizon" else prefix + f.name
@@ -181,7 +180,7 @@ def configs_of(monkeypatch, *arguments):
         raise fac.UserError("enough")
 
     monkeypatch.setattr(fac, "from_args", watched)
-    for function in ("lookup_task", "load_model", "benchmark_prediction"):
+    for function in ("lookup_task", "load_model"):
         monkeypatch.setattr(fac, function, stop)
     assert fac.main([str(a) for a in arguments]) == 2
     monkeypatch.undo()
@@ -191,7 +190,6 @@ def configs_of(monkeypatch, *arguments):
 def test_default_settings_are_those_of_the_dataclasses(monkeypatch):
     assert configs_of(monkeypatch, "distill") == (fac.DistillConfig(), fac.PlannerConfig())
     assert configs_of(monkeypatch, "evaluate", "--model", "x") == (fac.PlannerConfig(),)
-    assert configs_of(monkeypatch, "benchmark") == (fac.PlannerConfig(),)
 
 
 def test_preset_paper_is_the_paper(monkeypatch):
@@ -333,10 +331,6 @@ def test_what_diverges_is_refused_and_leaves_no_weights(tmp_path, files, steps):
     ([], ["COMMAND"]),
     (["tarin"], ["'tarin'", "distill"]),
     (["evaluate"], ["--model"]),
-    (["benchmark", "--robots", "reecher"], ["'reecher'", *fac.ROBOTS]),
-    (["benchmark", "--runs", "9"], ["runs", "at least 10"]),
-    (["benchmark", "--workers", "-1"], ["--workers", "-1"]),
-    (["benchmark", "--elites", "600"], ["600 elites", "512 samples"]),
     (["evaluate", "--model", "none.npz"], ["none.npz", "no such file"]),
     (["evaluate", "--model", "{files}/corrupt.npz"], ["corrupt.npz", "not a readable .npz"]),
     (["evaluate", "--model", "{files}/replay.npz"], ["replay.npz", "expert or student"]),
@@ -367,58 +361,6 @@ def test_a_student_is_no_expert(tmp_path, files, distilled):
     _, folder = distilled
     done = run(*distill_arguments(files, "--expert", folder / "student.npz"), cwd=tmp_path)
     refused(done, "student.npz", "kind", "'expert'", "'student'")
-
-
-# benchmark ----------------------------------------------------------------------------
-
-
-def test_the_benchmark_refuses_a_picture_it_cannot_draw(tmp_path, no_plots):
-    refused(run("benchmark", "--figure", "x.png", cwd=tmp_path, env=no_plots), "matplotlib")
-
-
-def test_benchmark_measures_every_mode(tmp_path):
-    flags = ["--robots", "reacher", "hopper", "--runs", "10", "--samples", "16", "--iterations",
-             "1", "--json"]
-    if importlib.util.find_spec("matplotlib"):
-        flags += ["--figure", "figure6.png"]
-    done = run("benchmark", *flags, cwd=tmp_path)
-    found = last_json(done)
-    assert set(found) == {"prediction", "decision", "speedup", "handover_us", "cores"}
-    assert found["cores"] == fac.cores()
-    assert found["cores"] == 1 or found["handover_us"] > 0  # one core: no worker by default
-    modes, functions = ("one-thread", "processes", "critical-path"), ("f_T", "f_R", "f_Q")
-    rows = {(r["robot"], r["model"], r["function"], r["mode"]): r for r in found["prediction"]}
-    assert set(rows) == {(robot, *subject) for robot in ("reacher", "hopper") for subject in (
-        *((m, f, "one-thread") for m in ("TD-MPC", "10% TD-MPC", "TAP") for f in functions),
-        *(("Fac-TDMPC", f, mode) for f in functions for mode in modes))}
-    assert all(r["ms_mean"] > 0 and r["ms_std"] >= 0 for r in rows.values())
-    decisions = {(r["robot"], r["model"], r["preset"], r["mode"], r["samples"], r["iterations"]): r
-                 for r in found["decision"]}
-    assert len(decisions) == len(found["decision"]) == 2 * 2 * 4 * 3
-    for r in decisions.values():
-        assert np.isclose(r["ratio_to_floor"], r["ms_median"] / r["floor_ms"])
-    speedup = {(r["robot"], r["function"], r["mode"]): r for r in found["speedup"]}
-    assert set(speedup) == {(robot, f, mode) for robot in ("reacher", "hopper")
-                            for f in (*functions, "decision") for mode in modes}
-    assert round(speedup["reacher", "f_T", "critical-path"]["paper"], 1) == 4.7
-    assert round(speedup["hopper", "f_T", "processes"]["paper"], 1) == 7.1
-    row = speedup["hopper", "decision", "one-thread"]
-    times = [decisions["hopper", m, "section51", "one-thread", 16, 1]["ms_median"]
-             for m in ("TD-MPC", "Fac-TDMPC")]
-    assert row["paper"] is None and np.isclose(row["value"], times[0] / times[1])
-    for part in ("hopper", "critical-path", "paper's x", "16 x 1", "hand-over"):
-        assert part in done.stdout
-    assert os.listdir(tmp_path) == ["figure6.png"] * ("--figure" in flags)
-    if "--figure" in flags:
-        assert (tmp_path / "figure6.png").read_bytes()[:4] == b"\x89PNG"
-
-
-def test_benchmark_without_workers_and_with_a_budget_of_its_own(tmp_path):
-    found = last_json(run("benchmark", "--robots", "reacher", "reacher", "--runs", "10",
-                          "--samples", "128", "--iterations", "2", "--workers", "0", "--json",
-                          cwd=tmp_path))
-    assert found["handover_us"] is None
-    assert len(found["prediction"]) == 18 and len(found["decision"]) == 2 * 4
 
 
 # distill ------------------------------------------------------------------------------

@@ -288,16 +288,6 @@ def test_an_unguarded_script_gets_an_error_not_a_hang(tmp_path):
     assert done.returncode != 0 and "__main__" in done.stderr
 
 
-def test_multiply_adds_count_the_weights_of_equation_2():
-    model = random_model(3)
-    sizes = {name: sum(v.size for k, v in model.params.items() if k.startswith(name)
-                       and k.endswith("weight") and v.shape[2] > 1)
-             for name in ("_dynamics", "_reward", "_Q")}
-    config = fac.PlannerConfig(samples=7, iterations=2, horizon=3)
-    assert fac.multiply_adds(model.config, config) == 7 * 2 * (
-        3 * (sizes["_dynamics"] + sizes["_reward"]) + sizes["_Q"])
-
-
 def refuses(connection):
     raise fac.UserError("not on this machine")
 
