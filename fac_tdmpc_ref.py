@@ -42,6 +42,7 @@ import functools
 import json
 import multiprocessing
 import multiprocessing.connection
+import operator
 import os
 import pickle
 import signal
@@ -67,26 +68,53 @@ class UserError(Exception):
 # ======================================================================================
 
 
-def field(default, help, paper=None, choices=None):
-    """A dataclass field with its help text; `paper` is the paper's value where ours departs."""
-    return dataclasses.field(default=default, metadata={
-        "help": help, "paper": paper, "choices": choices})
+EPISODE_STEPS = 500  # decisions in an episode: 1000 control steps of dm_control
+ACTION_REPEAT = 2  # control steps a decision; their rewards are added
+
+
+def field(default, help, **about):
+    """A dataclass field with its help, its range (`least`, `above`, `most`) or its `choices`, and,
+    where ours departs from it, the value of the `paper`."""
+    return dataclasses.field(default=default, metadata={"help": help, **about})
+
+
+RANGE = {"least": ("at least {}", operator.ge), "above": ("above {}", operator.gt),
+         "most": ("at most {}", operator.le)}
+
+
+class Settings:
+    """Base of the configs below: UserError for a value that its field rules out."""
+
+    def __post_init__(self):
+        for f in dataclasses.fields(self):
+            value = getattr(self, f.name)
+            rules = [(words.format(f.metadata[bound]), holds(value, f.metadata[bound]))
+                     for bound, (words, holds) in RANGE.items() if bound in f.metadata]
+            if "choices" in f.metadata:
+                choices = f.metadata["choices"]
+                rules.append((f"one of {', '.join(choices)}", value in choices))
+            if isinstance(value, float):
+                rules.append(("finite", np.isfinite(value)))
+            if not all(holds for _, holds in rules):
+                raise UserError(f"{type(self).__name__}: {f.name} must be "
+                                f"{' and '.join(words for words, _ in rules)}, not {value!r}")
 
 
 @dataclass(frozen=True)
-class ModelConfig:
+class ModelConfig(Settings):
     """Sizes of a world model. Raises UserError if the agents don't share the actions evenly."""
     dim_obs: int = field(0, "O: observation features")
     dim_action: int = field(0, "A: action dimensions")
     num_agents: int = field(1, "N: 1 is TD-MPC, A is Fac-TDMPC")
-    latent_dim: int = field(50, "m: latent features of an agent (Table 2)")
-    enc_dim: int = field(256, "hidden width of the encoder (Table 2)")
-    mlp_dim: int = field(512, "hidden width of an agent's other networks (Table 2)")
+    latent_dim: int = field(50, "m: latent features of an agent (Table 2)", least=1)
+    enc_dim: int = field(256, "hidden width of the encoder (Table 2)", least=1)
+    mlp_dim: int = field(512, "hidden width of an agent's other networks (Table 2)", least=1)
     expert_latent_dim: int = field(0, "features of the expert's latent, where the trained encoder "
-                                   "reads that; 0: it reads the observation")
-    expert_enc_dim: int = field(256, "hidden width of the frozen expert encoder below it")
+                                   "reads that; 0: it reads the observation", least=0)
+    expert_enc_dim: int = field(256, "hidden width of the frozen expert encoder below it", least=1)
 
     def __post_init__(self):
+        super().__post_init__()
         if self.num_agents < 1:
             raise UserError(f"the number of agents must be one of {divisors(self.dim_action)}, "
                             f"not {self.num_agents}")
@@ -102,41 +130,36 @@ class ModelConfig:
 
 
 @dataclass(frozen=True)
-class PlannerConfig:
+class PlannerConfig(Settings):
     """MPPI. Raises UserError for values that can't plan."""
-    samples: int = field(512, "S: action sequences drawn in an iteration (Table 2)")
-    iterations: int = field(6, "refinements of the proposal in a decision (Table 2)")
-    elites: int = field(0, "sequences that refine the proposal; 0: samples / 8 (Table 2: 64)")
-    pi_trajs: int = field(24, "policy proposals, where the model has a policy (Table 2)")
+    samples: int = field(512, "S: action sequences drawn in an iteration (Table 2)", least=1)
+    iterations: int = field(6, "refinements of the proposal in a decision (Table 2)", least=1)
+    elites: int = field(0, "sequences that refine the proposal; 0: samples / 8 (Table 2: 64)",
+                       least=0)
+    pi_trajs: int = field(24, "policy proposals, where the model has a policy (Table 2)", least=0)
     horizon: int = field(3, "H of Equation 2: H rewards, then Q of action H + 1; 0: Q alone "
-                         "(Table 2)")
-    discount: float = field(0.99, "gamma, where the model's file names no other (Table 2)")
-    min_std: float = field(0.05, "smallest sampling deviation (Table 2)")
-    max_std: float = field(2.0, "first and largest sampling deviation (Table 2)")
-    temperature: float = field(0.5, "an elite weighs exp(temperature * return) (Table 2)")
-    momentum: float = field(0.1, "share of the old mean that is kept (TD-MPC's code)")
+                         "(Table 2)", least=0, most=EPISODE_STEPS - 1)
+    discount: float = field(0.99, "gamma, where the model's file names no other (Table 2)",
+                            least=0, most=1)
+    min_std: float = field(0.05, "smallest sampling deviation (Table 2)", above=0)
+    max_std: float = field(2.0, "first and largest sampling deviation (Table 2)", above=0)
+    inverse_temperature: float = field(0.5, "an elite weighs exp(this * return); the `temperature` "
+                                       "of Table 2, which TD-MPC's code multiplies by", least=0)
+    momentum: float = field(0.1, "share of the old mean in the new one (TD-MPC's code)",
+                            least=0, most=1)
     returns: str = field("fast", "the same return as it reads (plain: h_step_return), or fast",
                          choices=("fast", "plain"))
     output: str = field("sampled", "the action: sampled from the elites by weight (TD-MPC's code) "
                         "or the proposal's mean (the paper's text)", choices=("sampled", "mean"))
 
     def __post_init__(self):
-        for name, least in (("samples", 1), ("iterations", 1), ("elites", 0), ("horizon", 0),
-                            ("pi_trajs", 0), ("temperature", 0)):
-            if not least <= getattr(self, name) < np.inf:  # nan is not, either
-                raise UserError(f"planner: {name} must be at least {least} and finite, not "
-                                f"{getattr(self, name)}")
-        for name in ("discount", "momentum"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise UserError(f"planner: {name} must lie between 0 and 1, not "
-                                f"{getattr(self, name)}")
+        super().__post_init__()
         if self.elites > self.samples:
-            raise UserError(f"planner: {self.elites} elites can't be chosen from {self.samples} "
-                            f"samples; lower elites or raise samples")
-        if not 0 < self.min_std <= self.max_std < np.inf:
-            raise UserError(f"planner: needs 0 < min_std <= max_std, both finite, not "
-                            f"{self.min_std}, {self.max_std}")
-        check_choices(self)
+            raise UserError(f"PlannerConfig: {self.elites} elites can't be chosen from "
+                            f"{self.samples} samples; lower elites or raise samples")
+        if self.min_std > self.max_std:
+            raise UserError(f"PlannerConfig: min_std must be at most max_std ({self.max_std}), not "
+                            f"{self.min_std}")
 
     @property
     def num_elites(self):
@@ -145,113 +168,77 @@ class PlannerConfig:
 
 
 @dataclass(frozen=True)
-class DistillConfig:
+class DistillConfig(Settings):
     """Algorithm 1. `--preset paper` takes each field's paper value."""
-    steps: int = field(20_000, "gradient steps [D1]", paper=100_000)
-    batch_size: int = field(32, "B: states in a step [D1]", paper=512)
-    noise_samples: int = field(5, "K: perturbations of each action (section 4.4) [D1]", paper=10)
-    noise_std: float = field(2.0, "largest deviation of the perturbations [D8]", paper=0.5)
+    steps: int = field(20_000, "gradient steps [D1]", paper=100_000, least=1)
+    batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=1)
+    noise_samples: int = field(5, "K: perturbations of each action (section 4.4) [D1]", paper=10,
+                               least=2)
+    noise_std: float = field(2.0, "largest deviation of the perturbations [D8]", paper=0.5, above=0)
     noise_std_min: float = field(0.2, "smallest; each state's is drawn between, evenly in the "
-                                 "logarithm [D8]", paper=0.5)
+                                 "logarithm [D8]", paper=0.5, above=0)
     clip_actions: bool = field(True, "clip perturbed actions to [-1, 1], where planning looks [D8]",
                                paper=False)
-    horizon: int = field(3, "H: the loss sums over h = 0..H, planning looks as far (Table 2)")
-    lam: float = field(1.0, "lambda: weight of step h is lambda^h (rho in Table 2) [D5]", paper=0.5)
-    reward_coef: float = field(0.5, "weight of the rewards' divergence (Table 2)")
-    value_coef: float = field(0.1, "weight of each Q's divergence (Table 2)")
-    temperature_student: float = field(0.5, "T_s of Equation 4 (authors' code)")
-    temperature_expert: float = field(0.5, "T_e (authors' code)")
+    reuse: int = field(4, "steps that learn from a state's perturbations, whose expert's "
+                       "predictions are computed once [D1]", paper=1, least=1)
+    horizon: int = field(3, "H: the loss sums over h = 0..H, planning looks as far (Table 2)",
+                         least=0, most=EPISODE_STEPS - 1)
+    lam: float = field(1.0, "lambda: weight of step h is lambda^h (rho in Table 2) [D5]", paper=0.5,
+                       least=0)
+    reward_coef: float = field(0.5, "weight of the rewards' divergence (Table 2)", least=0)
+    value_coef: float = field(0.1, "weight of each Q's divergence (Table 2)", least=0)
+    temperature_student: float = field(0.5, "T_s of Equation 4 (authors' code)", above=0)
+    temperature_expert: float = field(0.5, "T_e (authors' code)", above=0)
     kl: str = field("forward", "forward: D(expert || student), as Hinton and Rusu distil; reverse: "
                     "D(student || expert), Algorithm 1's order of arguments [D2]",
                     paper="reverse", choices=("forward", "reverse"))
     encoder_input: str = field("latent", "the student's encoder reads the observation, or the "
                                "expert's latent [D3]", paper="observation",
                                choices=("latent", "observation"))
-    lr: float = field(1e-3, "Adam's learning rate [D1]", paper=1e-4)
+    lr: float = field(1e-3, "Adam's learning rate [D1]", paper=1e-4, above=0)
     lr_schedule: str = field("cosine", "cosine (to zero) or constant [D1]", paper="constant",
                              choices=("cosine", "constant"))
-    warmup: int = field(200, "steps over which lr rises from zero [D1]", paper=0)
-    grad_clip: float = field(10.0, "largest gradient norm (Table 2)")
+    warmup: int = field(200, "steps over which lr rises from zero [D1]", paper=0, least=0)
+    grad_clip: float = field(10.0, "largest gradient norm (Table 2)", above=0)
     sizes: str = field("table2", "agent sizes: table2 (m = 50) or section51 (m = 512 // N)",
                        choices=("table2", "section51"))
     new_targets: float = field(0.5, "reacher only: share of states whose target is drawn anew, as "
-                               "the task draws it [D7]", paper=0.0)
-    own_episodes: int = field(16, "episodes that the student plays after each of the first three "
-                              "quarters of the steps; their states join the replay's [D9]",
-                              paper=0)
-    own_share: float = field(0.25, "share of states from the student's own episodes [D9]",
-                             paper=0.0)
-    held_out: float = field(0.05, "share of episodes kept for the rank correlation")
+                               "the task draws it [D7]", paper=0.0, least=0, most=1)
+    held_out: float = field(0.05, "share of episodes held out for the rank correlation",
+                            above=0, most=0.5)
 
     def __post_init__(self):
-        for name, least in (("steps", 1), ("batch_size", 1), ("horizon", 0), ("noise_samples", 2),
-                            ("lam", 0), ("reward_coef", 0), ("value_coef", 0), ("warmup", 0),
-                            ("own_episodes", 0)):
-            if not least <= getattr(self, name) < np.inf:
-                raise UserError(f"distillation: {name} must be at least {least} and finite, not "
-                                f"{getattr(self, name)}")
-        for name in ("noise_std_min", "temperature_student", "temperature_expert", "lr",
-                     "grad_clip"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise UserError(f"distillation: {name} must be above 0 and finite, not "
-                                f"{getattr(self, name)}")
-        if not self.noise_std_min <= self.noise_std < np.inf:
-            raise UserError(f"distillation: noise_std must be at least noise_std_min "
-                            f"({self.noise_std_min}) and finite, not {self.noise_std}")
-        for name in ("new_targets", "own_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise UserError(f"distillation: {name} is a share, not {getattr(self, name)}")
-        if self.horizon >= EPISODE_STEPS:
-            raise UserError(f"distillation: horizon must be below an episode's {EPISODE_STEPS}, "
-                            f"not {self.horizon}")
-        if not 0 < self.held_out <= 0.5:
-            raise UserError(f"distillation: held_out must lie between 0 and 0.5, not "
-                            f"{self.held_out}")
-        check_choices(self)
+        super().__post_init__()
+        if self.noise_std < self.noise_std_min:
+            raise UserError(f"DistillConfig: noise_std must be at least noise_std_min "
+                            f"({self.noise_std_min}), not {self.noise_std}")
 
 
 @dataclass(frozen=True)
-class ExpertConfig:
+class ExpertConfig(Settings):
     """TD-MPC's training (Equation 1), here and in data/train_expert.py."""
-    latent_dim: int = field(50, "m: latent features (Table 2)")
-    enc_dim: int = field(256, "hidden width of the encoder (Table 2)")
-    mlp_dim: int = field(512, "hidden width of the other networks (Table 2)")
-    horizon: int = field(3, "H: steps of the latent rollout (Table 2)")
-    batch_size: int = field(512, "segments in an update (Table 2)")
-    updates_per_step: float = field(1.0, "updates for each decision")
-    lr: float = field(5e-4, "Adam's learning rate (authors' expert)")
-    discount: float = field(0.99, "gamma (Table 2)")
-    lam: float = field(0.5, "lambda of Equation 1 (rho in Table 2)")
-    consistency_coef: float = field(2.0, "weight of the latent term (TD-MPC)")
-    reward_coef: float = field(0.5, "weight of the reward term (Table 2)")
-    value_coef: float = field(0.1, "weight of the value term (Table 2)")
-    grad_clip: float = field(10.0, "largest gradient norm (Table 2)")
-    tau: float = field(0.01, "step of the moving-average targets (Table 2)")
-    target_every: int = field(2, "updates between two steps of the targets (TD-MPC)")
-    std_start: float = field(0.5, "smallest sampling deviation at the start (TD-MPC)")
-    std_steps: int = field(25_000, "decisions over which it falls to the planner's min_std")
-    seed_decisions: int = field(4_000, "random decisions before the first update")
-    buffer_size: int = field(1_000_000, "replay capacity, transitions (Table 2)")
+    latent_dim: int = field(50, "m: latent features (Table 2)", least=1)
+    enc_dim: int = field(256, "hidden width of the encoder (Table 2)", least=1)
+    mlp_dim: int = field(512, "hidden width of the other networks (Table 2)", least=1)
+    horizon: int = field(3, "H: steps of the latent rollout (Table 2)", least=1, most=EPISODE_STEPS)
+    batch_size: int = field(512, "segments in an update (Table 2)", least=1)
+    updates_per_step: float = field(1.0, "updates for each decision", least=0)
+    lr: float = field(5e-4, "Adam's learning rate (authors' expert)", above=0)
+    discount: float = field(0.99, "gamma (Table 2)", least=0, most=1)
+    lam: float = field(0.5, "lambda of Equation 1 (rho in Table 2)", least=0)
+    consistency_coef: float = field(2.0, "weight of the latent term (TD-MPC)", least=0)
+    reward_coef: float = field(0.5, "weight of the reward term (Table 2)", least=0)
+    value_coef: float = field(0.1, "weight of the value term (Table 2)", least=0)
+    grad_clip: float = field(10.0, "largest gradient norm (Table 2)", above=0)
+    tau: float = field(0.01, "step of the moving-average targets (Table 2)", least=0, most=1)
+    target_every: int = field(2, "updates between two steps of the targets (TD-MPC)", least=1)
+    std_start: float = field(0.5, "smallest sampling deviation at the start (TD-MPC)", least=0)
+    std_steps: int = field(25_000, "decisions over which it falls to the planner's min_std",
+                           least=0)
+    seed_decisions: int = field(4_000, "random decisions before the first update", least=0)
+    buffer_size: int = field(1_000_000, "replay capacity, transitions (Table 2)", least=1)
     buffer_dtype: str = field("float32", "how the replay is kept in memory",
                               choices=("float32", "float16"))
-
-    def __post_init__(self):
-        for name in ("latent_dim", "enc_dim", "mlp_dim", "horizon", "batch_size", "target_every",
-                     "buffer_size"):
-            if getattr(self, name) < 1:
-                raise UserError(f"training: {name} must be at least 1, not {getattr(self, name)}")
-        for name in ("updates_per_step", "discount", "lam", "consistency_coef", "reward_coef",
-                     "value_coef", "tau", "std_start", "std_steps", "seed_decisions"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise UserError(f"training: {name} must be at least 0 and finite, not "
-                                f"{getattr(self, name)}")
-        if self.horizon > EPISODE_STEPS:
-            raise UserError(f"training: horizon must be at most an episode's {EPISODE_STEPS}, not "
-                            f"{self.horizon}")
-        if not (0 < self.lr < np.inf and 0 < self.grad_clip < np.inf):
-            raise UserError(f"training: lr and grad_clip must be above 0 and finite, not {self.lr} "
-                            f"and {self.grad_clip}")
-        check_choices(self)
 
 
 def stream(seed, use, index=0):
@@ -263,14 +250,6 @@ def stream(seed, use, index=0):
 def divisors(n):
     """The numbers of agents that can share n action dimensions."""
     return [i for i in range(1, n + 1) if n % i == 0]
-
-
-def check_choices(config):
-    """Raise UserError if a field with choices holds something else."""
-    for f in dataclasses.fields(config):
-        value, choices = getattr(config, f.name), f.metadata["choices"]
-        if choices and value not in choices:
-            raise UserError(f"{f.name} must be one of {', '.join(choices)}, not {value!r}")
 
 
 def from_dict(config_class, values, where):
@@ -909,11 +888,15 @@ def learning_rate(config, t):
     return float(rate)
 
 
+POOL = 4096  # states whose predictions by the expert are computed in one go
+
+
 class Distiller:
     """Algorithm 1: one `step` after the other, reproducible from the seed, and from `state`.
 
-    The expert's side of the next step runs on a second thread while the student learns from
-    this one: NumPy lets go of the interpreter inside its products, so both cores are busy.
+    The expert is frozen: what it predicts for a pool of states and their perturbed actions is
+    computed once, on a thread of its own, and learned from `reuse` times. Two more threads learn
+    from half of each batch: NumPy lets go of the interpreter inside its products.
     """
 
     def __init__(self, expert, replay, config, num_agents=None, seed=0):
@@ -923,70 +906,88 @@ class Distiller:
             raise UserError(f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, "
                             f"{replay.dim_action}), the expert expects ({sizes.dim_obs}, "
                             f"{sizes.dim_action}); pass the replay of the expert's task")
-        self.expert, self.config, self.seed = expert, config, seed
+        self.expert, self.replay, self.config, self.seed = expert, replay, config, seed
         agents = sizes.dim_action if num_agents is None else num_agents
         with one_thread():
             self.optimizer, self.student = new_student(expert, agents, config, seed)
-        self.replay, self.own = replay, ReplayBuffer(  # [D9]
-            sizes.dim_obs, sizes.dim_action, 3 * config.own_episodes * EPISODE_STEPS, np.float16)
-        self.own_count = round(config.own_share * config.batch_size) if config.own_episodes else 0
-        self._teacher, self._next = ThreadPoolExecutor(1), None
-        self._arenas = Arena(), Arena()  # the student's and the teacher's
-        self._threads = one_thread()  # until `close`, in this thread and the teacher's
+        needed = config.steps * config.batch_size // config.reuse
+        self.pool_size = max(config.batch_size, min(POOL, needed))
+        self._number, self._pool, self._next = None, None, None
+        self._threads = ThreadPoolExecutor(3)
+        self._learners = [(Arena(), *flatten({k: np.zeros_like(v) for k, v in
+                                              self.optimizer.params.items()})) for _ in range(2)]
+        self._blas = one_thread()  # until `close`, in all threads
+
+    def pool(self, number):
+        """Line 4 and the expert's part for one pool: features, perturbed actions, targets."""
+        rng, parts = stream(self.seed, "pool", number), []
+        reacher = str(self.replay.header.get("task")).startswith("reacher")
+        for size in np.diff(np.r_[0:self.pool_size:256, self.pool_size]):  # what fits the cache
+            obs, actions = self.replay.sequences(rng.choice(self.train_starts, size),
+                                                 self.config.horizon + 1)
+            if reacher:  # [D7]
+                chosen = rng.random(size) < self.config.new_targets
+                obs[3:5, chosen] = new_targets(obs[:, chosen], rng)
+            parts.append(perturbed_batch(self.expert, self.student, obs, actions, self.config, rng))
+        features, actions, targets = zip(*parts)
+        return (np.concatenate(features, 2), np.concatenate(actions, 2),
+                [np.concatenate(target, 1) for target in zip(*targets)])
 
     def batch(self, t):
-        """Line 4 and the expert's part of step t: features, perturbed actions, targets."""
-        rng = stream(self.seed, "batch", t)
-        starts = rng.choice(self.train_starts, self.config.batch_size)
-        obs, actions = self.replay.sequences(starts, self.config.horizon + 1)
-        if len(self.own):  # the first ones are the student's own [D9]
-            own, actions[..., :self.own_count], _ = self.own.sample(
-                rng, self.own_count, self.config.horizon + 1, "")
-            obs[:, :self.own_count] = own[0]
-        task = str(self.replay.header.get("task"))
-        if task.startswith("reacher"):  # [D7]
-            chosen = rng.random(len(starts)) < self.config.new_targets
-            obs[3:5, chosen] = new_targets(obs[:, chosen], rng)
-        self._arenas[1].rewind()
-        return perturbed_batch(self.expert, self.student, obs, actions, self.config, rng,
-                               self._arenas[1].empty)
+        """Step t's part of its pool, which is gone through `reuse` times, in another order each."""
+        size, reuse = self.config.batch_size, self.config.reuse
+        steps = reuse * self.pool_size // size  # that a pool lasts
+        number, i = divmod(t, steps)
+        if number != self._number:
+            ready = self._next if self._number == number - 1 else None
+            self._pool = ready.result() if ready else self.pool(number)
+            if t - i + steps < self.config.steps:
+                self._next = self._threads.submit(self.pool, number + 1)
+            rng, self._number = stream(self.seed, "order", number), number
+            self._order = np.concatenate([rng.permutation(self.pool_size) for _ in range(reuse)])
+        chosen = self._order[i * size:(i + 1) * size]
+        features, actions, targets = self._pool
+        return features[..., chosen], actions[:, :, chosen], [x[:, chosen] for x in targets]
 
     def step(self):
         """Lines 4 to 6 once. Returns loss, mean reward divergence, mean value divergence."""
-        batch = (self._next or self._teacher.submit(self.batch, self.t)).result()
-        self._next = self._teacher.submit(self.batch, self.t + 1)
-        self._arenas[0].rewind()
-        losses = distill_loss(self.student, *batch, self.config, self.optimizer.grads,
-                              self._arenas[0].empty)
+        features, actions, targets = self.batch(self.t)
+
+        def learn(learner, part):
+            arena, _, grads = learner
+            arena.rewind()
+            return distill_loss(self.student, features[..., part], actions[:, :, part],
+                                [x[:, part] for x in targets], self.config, grads, arena.empty)
+
+        parts = np.array_split(np.arange(self.config.batch_size), len(self._learners))
+        parts = [part for part in parts if len(part)]
+        total = np.zeros(3)
+        for part, learner, losses in zip(parts, self._learners,
+                                         self._threads.map(learn, self._learners, parts)):
+            share, gradient = len(part) / self.config.batch_size, learner[1]
+            total += share * np.array(losses)
+            self.optimizer.gradient += gradient.dtype.type(share) * gradient
+            gradient[:] = 0
         self.optimizer.step(learning_rate(self.config, self.t), self.config.grad_clip)
-        return losses
+        return tuple(total.tolist())
 
     @property
     def t(self):
         """Steps made so far."""
         return self.optimizer.adam.t
 
-    def add(self, episodes):
-        """Let episodes that the student played, as `ReplayBuffer.add` takes them, join the data."""
-        for episode in episodes:
-            self.own.add(*episode)
-        self._next = None  # drawn without them
-
     def state(self):
         """Everything that a resumed run needs."""
-        return {**self.optimizer.state(), **{f"own_{k}": v for k, v in self.own.state().items()}}
+        return self.optimizer.state()
 
     def load(self, state):
         """Go on from a `state`."""
         self.optimizer.load(state)
-        self.own.load({k[4:]: v for k, v in state.items() if k.startswith("own_")})
-        self._next = None
 
     def close(self):
-        """Stop the teacher's thread and give BLAS its threads back."""
-        self._teacher.shutdown(wait=True, cancel_futures=True)
-        self._next = None
-        self._threads.restore_original_limits()
+        """Stop the threads and give BLAS its own back."""
+        self._threads.shutdown(wait=True, cancel_futures=True)
+        self._blas.restore_original_limits()
 
 
 def perturbed_batch(expert, student, obs, actions, config, rng, empty=np.empty):
@@ -1006,25 +1007,40 @@ def perturbed_batch(expert, student, obs, actions, config, rng, empty=np.empty):
     return features, noise, predict(expert, z, noise, empty=empty)
 
 
-def rank_correlation(distiller, states, seed):
-    """Spearman's correlation of the global Q (mean of both) over perturbed actions, at each h.
+def horizon_returns(rewards, q1, q2, discount):
+    """Equation 2 for every H at once, from `predict`'s global rewards and Q: G^0, ..., G^H.
 
-    Mean over `states` held-out states with 32 actions each; 1 means that the student orders
-    actions as the expert does, which is what the loss asks for (section 4.4). Returns (L,).
+    All (L, B, K), K sequences in each state.
     """
+    gamma = (discount ** np.arange(len(rewards))).astype(rewards.dtype)[:, None, None]
+    return np.cumsum(gamma * rewards, 0) - gamma * rewards + gamma * (q1 + q2) / 2
+
+
+def spearman(x, y):
+    """Spearman's correlation over the last axis, where K values are ranked: (..., K) -> (...)."""
     from scipy.stats import rankdata
+    x, y = (rankdata(v, axis=-1) - (v.shape[-1] + 1) / 2 for v in (x, y))
+    norms = np.linalg.norm(x, axis=-1) * np.linalg.norm(y, axis=-1)
+    return (x * y).sum(-1) / np.maximum(norms, 1e-12)
+
+
+def rank_correlation(distiller, states, seed, discount=0.99):
+    """How alike student and expert order perturbed actions, which is what the loss asks for.
+
+    Spearman's correlation over 32 action sequences, mean over `states` held-out states; 1 is the
+    same order (section 4.4). Returns that of the global Q at each step h of the rollout, and that
+    of the global return G^H (Equation 2), which planning ranks by, for each H: two (L,).
+    """
     rng = stream(seed, "rank correlation")
     starts = rng.choice(distiller.held_out_starts, states)
     student, config = distiller.student, dataclasses.replace(distiller.config, noise_samples=32)
-    sequences = distiller.replay.sequences(starts, distiller.config.horizon + 1)
-    features, actions, (_, *q_expert) = perturbed_batch(distiller.expert, student, *sequences,
-                                                        config, rng)
-    _, *q_student = predict(student, student.encode_features(features), actions)
-    if not np.isfinite(q_student).all():
-        return np.full(len(actions), np.nan)
-    ranks = [rankdata(q1 + q2, axis=-1) - 16.5 for q1, q2 in (q_expert, q_student)]
-    norms = [np.linalg.norm(r, axis=-1) for r in ranks]
-    return ((ranks[0] * ranks[1]).sum(-1) / np.maximum(norms[0] * norms[1], 1e-12)).mean(-1)
+    sequences = distiller.replay.sequences(starts, config.horizon + 1)
+    features, actions, expert = perturbed_batch(distiller.expert, student, *sequences, config, rng)
+    own = predict(student, student.encode_features(features), actions)
+    if not np.isfinite(own).all():
+        return (np.full(len(actions), np.nan),) * 2
+    return (spearman(expert[1] + expert[2], own[1] + own[2]).mean(-1),
+            spearman(*(horizon_returns(*out, discount) for out in (expert, own))).mean(-1))
 
 
 # ======================================================================================
@@ -1208,7 +1224,7 @@ def mppi(returns, mean, config, rngs, proposals=None):
         best = np.argpartition(-G, config.num_elites - 1, axis=1)[:, :config.num_elites]
         elites = np.take_along_axis(actions, best[:, None, None], 3)
         G = np.take_along_axis(G, best, 1)
-        scores = np.exp(config.temperature * (G - G.max(1, keepdims=True)))
+        scores = np.exp(config.inverse_temperature * (G - G.max(1, keepdims=True)))
         scores /= scores.sum(1, keepdims=True)
         p = scores[:, None, None]
         new = (p * elites).sum(3, keepdims=True)
@@ -1526,8 +1542,6 @@ TASKS = {
     "humanoid-stand": ("humanoid", "stand", 67, 21),
     "humanoid-walk": ("humanoid", "walk", 67, 21),
 }
-EPISODE_STEPS = 500  # decisions in an episode: 1000 control steps of dm_control
-ACTION_REPEAT = 2  # control steps a decision; their rewards are added
 REACHER_TARGET = {"easy": 0.05, "hard": 0.015}  # radius of the target, metres
 FINGER_RADIUS = 0.01
 REACHER_LINK = 0.09
@@ -2080,7 +2094,7 @@ def interleaved_seconds(calls, rounds, label):
 
 
 CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correlation_h0",
-         "rank_correlation_last")
+         "rank_correlation_last", "rank_correlation_return")
 
 
 def check_finite(values, update, lr):
@@ -2091,12 +2105,11 @@ def check_finite(values, update, lr):
                             f"diverged; lower the learning rate ({lr})")
 
 
-def train_student(distiller, out, settings, playing, workers):
+def train_student(distiller, out, settings):
     """Algorithm 1 to its end, with a learning curve and checkpoints in `out`.
 
     A run that was cut off goes on from its checkpoint and ends as if it had not been. Returns
-    (curve rows, seconds). playing, workers: the planner and the processes of the student's own
-    episodes [D9].
+    (curve rows, seconds).
     """
     checkpoint, config = out / "checkpoint.npz", distiller.config
     curve, before = [], 0.0
@@ -2110,9 +2123,6 @@ def train_student(distiller, out, settings, playing, workers):
     losses = []
     with progress("distilling", config.steps, "step", distiller.t) as bar:
         while distiller.t < config.steps:
-            if distiller.own_count and (
-                    len(distiller.own) < distiller.t * 4 // config.steps * config.own_episodes):
-                distiller.add(own_episodes(distiller, settings["task"], playing, workers))
             rate = learning_rate(config, distiller.t)
             losses.append(distiller.step())
             check_finite({"loss is": losses[-1]}, distiller.t, config.lr)
@@ -2120,33 +2130,20 @@ def train_student(distiller, out, settings, playing, workers):
             if distiller.t % every == 0 or distiller.t == config.steps:
                 loss, kl_reward, kl_value = np.mean(losses, 0)
                 losses, seconds = [], before + time.time() - began
-                rank = rank_correlation(distiller, 64, distiller.seed)
+                rank, returns = rank_correlation(distiller, 64, distiller.seed)
                 check_finite({"weights are": distiller.optimizer.vector,
                               "student's predictions are": rank}, distiller.t, config.lr)
                 curve.append([distiller.t, round(seconds, 2), float(loss), float(kl_reward),
-                              float(kl_value), rate, float(rank[0]), float(rank[-1])])
+                              float(kl_value), rate, float(rank[0]), float(rank[-1]),
+                              float(returns[-1])])
                 bar.set_postfix_str(f"loss {loss:.4f} KL reward {kl_reward:.4f} value "
-                                    f"{kl_value:.4f} rank {rank[0]:.3f}", False)
+                                    f"{kl_value:.4f} rank {returns[-1]:.3f}", False)
                 write_curve(out / "curve.csv", CURVE, curve)
                 if time.time() - saved > 30 or distiller.t == config.steps:
                     write_npz(checkpoint, {"kind": "checkpoint", "settings": settings,
                                            "curve": curve, "seconds": seconds}, distiller.state())
                     saved = time.time()
     return curve, before + time.time() - began
-
-
-def own_episodes(distiller, task, playing, workers):
-    """The next episodes that the student plays, as `Distiller.add` takes them [D9]."""
-    count, part = distiller.config.own_episodes, EPISODE_STEPS // 20
-    with contextlib.closing(Actors(task, worker_count(workers, count) or 1)) as actors, \
-            progress("the student plays", count * EPISODE_STEPS, "decision") as bar:
-        actors.begin(training_seeds(distiller.seed, "own episode", len(distiller.own), count),
-                     0.0, {}, [])
-        for _ in range(0, EPISODE_STEPS, part):
-            actors.play(part, distiller.student, playing)
-            actors.wait()
-            bar.update(part * count)
-        return actors.collect()[0]
 
 
 def same_settings(found, expected, where):
@@ -2200,9 +2197,10 @@ def draw_curve(path, curve, title):
     for key, label in (("kl_reward", "rewards"), ("kl_value", "values")):
         left.semilogy(columns["step"], columns[key], label=label)
     left.set(xlabel="gradient step", ylabel="KL divergence", title=title)
-    for key, label in (("rank_correlation_h0", "h = 0"), ("rank_correlation_last", "last h")):
+    for key, label in (("rank_correlation_h0", "Q, h = 0"), ("rank_correlation_last", "Q, h = H"),
+                       ("rank_correlation_return", "return G")):
         right.plot(columns["step"], columns[key], label=label)
-    right.set(xlabel="gradient step", ylabel="rank correlation of Q",
+    right.set(xlabel="gradient step", ylabel="rank correlation",
               title="held-out states", ylim=(None, 1))
     for axes in (left, right):
         axes.legend()
@@ -2284,10 +2282,8 @@ def load_data(args):
 def distil(distiller, args, planning, header, out):
     """Algorithm 1 to its end; writes student, curve and configuration. Returns result's part."""
     student, config, replay = distiller.student, distiller.config, distiller.replay
-    playing = dataclasses.replace(planning, samples=64, iterations=3)  # cheap [D9]
     settings = {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
                 "distill": dataclasses.asdict(config),
-                "own_planner": dataclasses.asdict(playing) if distiller.own_count else None,
                 "data": [checksum(distiller.expert.params.values()),
                          checksum([replay.observation, replay.action, replay.ends]),
                          replay.header.get("task")]}
@@ -2295,8 +2291,8 @@ def distil(distiller, args, planning, header, out):
           f"features, {len(distiller.optimizer.vector):,} weights; replay of "
           f"{replay.transitions:,} transitions; {config.steps:,} steps of {config.batch_size} x "
           f"{config.noise_samples}; results in {out}", file=sys.stderr)
-    curve, seconds = train_student(distiller, out, settings, playing, args.workers)
-    rank = rank_correlation(distiller, 256, args.seed)
+    curve, seconds = train_student(distiller, out, settings)
+    rank, returns = rank_correlation(distiller, 256, args.seed, planning.discount)
     save_model(out / "student.npz", student, {"kind": "student", **settings,
                                               "training": header.get("training", {})})
     with atomic_file(out / "config.json", "w") as file:
@@ -2304,7 +2300,8 @@ def distil(distiller, args, planning, header, out):
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
             "steps": config.steps, "seconds": round(seconds, 1), "kl_reward": curve[-1][3],
             "kl_value": curve[-1][4], "rank_correlation": float(rank[0]),
-            "rank_correlation_by_step": [float(r) for r in rank], "out": str(out),
+            "rank_correlation_by_step": rank.tolist(), "out": str(out),
+            "rank_correlation_returns": returns.tolist(),
             "picture": draw_curve(out / "curve.png", curve, f"{args.task}, seed {args.seed}")}
 
 
@@ -2364,11 +2361,11 @@ def report(result, planning, eval_seed):
         rows.append(row(f"student, {beside} worker{'s' * (beside != 1)} beside", None,
                         result["plan_ms_student"]))
     print_table(rows)
-    rank = result["rank_correlation_by_step"]
+    rank, returns = (result[f"rank_correlation_{what}"] for what in ("by_step", "returns"))
     share = "-" if result["kept"] is None else f"{result['kept']:.2f}"
     print(f"\nreturn kept {share}, rank correlation of Q {rank[0]:.3f} (h = 0) to {rank[-1]:.3f} "
-          f"(h = {len(rank) - 1}), distilled in {result['seconds']:.0f} s, "
-          f"{result['seconds_total']:.0f} s in all, {result['out']}/"
+          f"(h = {len(rank) - 1}), of the return {returns[-1]:.3f}, distilled in "
+          f"{result['seconds']:.0f} s, {result['seconds_total']:.0f} s in all, {result['out']}/"
           + ("" if result["picture"] else
              "\n(no picture: pip install 'fac-tdmpc-ref[plots]' draws curve.png)"))
 
@@ -2819,14 +2816,15 @@ def add_config(parser, config_class, title=None, prefix="", skip=(), **defaults)
     for f in dataclasses.fields(config_class):
         if f.name in skip:
             continue
-        default, paper = defaults.get(f.name, f.default), f.metadata["paper"]
+        default, paper = defaults.get(f.name, f.default), f.metadata.get("paper")
         if paper is None and default != f.default:
             paper = f.default
         shown = f"{default}" if paper is None else f"{default}; paper: {paper}"
         kind = {"action": argparse.BooleanOptionalAction}
         if not isinstance(default, bool):
-            kind = {"type": type(default), "choices": f.metadata["choices"],
-                    "metavar": None if f.metadata["choices"] else type(default).__name__.upper()}
+            choices = f.metadata.get("choices")
+            kind = {"type": type(default), "choices": choices,
+                    "metavar": None if choices else type(default).__name__.upper()}
         group.add_argument(f"--{prefix}{f.name}".replace("_", "-"), default=None,
                            dest=f"{config_class.__name__}.{f.name}",
                            help=f"{f.metadata['help']} [{shown}]", **kind)
@@ -2844,7 +2842,7 @@ def from_args(config_class, args, **defaults):
 def paper_preset(config_class):
     """The paper's value of every field that departs from it."""
     return {f.name: f.metadata["paper"] for f in dataclasses.fields(config_class)
-            if f.metadata["paper"] is not None}
+            if "paper" in f.metadata}
 
 
 def natural(text):
@@ -2929,8 +2927,7 @@ def make_parser():
     add_config(sub, PlannerConfig, "MPPI while training", "plan-", skip=("discount", "horizon"),
                **TRAINING_BUDGET)
     add_config(sub, DistillConfig, "The student (Algorithm 1), on the expert's batches and steps",
-               "distill-", skip=("steps", "batch_size", "new_targets", "own_episodes", "own_share",
-                                "held_out"),
+               "distill-", skip=("steps", "batch_size", "new_targets", "reuse", "held_out"),
                **FOLLOWING_DEFAULTS)
 
     sub = add_command(commands, "evaluate", command_evaluate, "Plan with a model (expert or "

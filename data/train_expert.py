@@ -212,7 +212,7 @@ class Learner:
             top, index = value.topk(planner.num_elites, 1)
             elites = actions.gather(2, index[None, :, :, None].expand(
                 length, -1, -1, dim_action))
-            score = torch.softmax(planner.temperature * top, 1)[None, :, :, None]
+            score = torch.softmax(planner.inverse_temperature * top, 1)[None, :, :, None]
             new_mean = (score * elites).sum(2)
             std = ((score * (elites - new_mean[:, :, None]) ** 2).sum(2)).sqrt()
             std = std.clamp(min_std, planner.max_std)
@@ -480,7 +480,7 @@ def write_golden(folder, replay, config):
             value, z = value + planner.discount ** h * r, z_next
         value = value + planner.discount ** planner.horizon * sum(model.q(z, actions[-1])) / 2
         top, index = value.topk(planner.num_elites)
-        score = torch.softmax(planner.temperature * top, 0)[None, :, None]
+        score = torch.softmax(planner.inverse_temperature * top, 0)[None, :, None]
         refined = (score * actions[:, index]).sum(1)
         std = (score * (actions[:, index] - refined[:, None]) ** 2).sum(1).sqrt()
     found.update(mppi_noise=noise, mppi_mean=mean, mppi_returns=value.numpy(),

@@ -77,7 +77,7 @@ class TorchPlanner:
             top, index = self.returns(z, actions).topk(config.num_elites, 1)
             elites = actions.gather(2, index[:, None, :, None].expand(-1, *actions.shape[1:2], -1,
                                                                       actions.shape[-1]))
-            score = torch.softmax(config.temperature * top, 1)[:, None, :, None]
+            score = torch.softmax(config.inverse_temperature * top, 1)[:, None, :, None]
             new = (score * elites).sum(2, keepdim=True)
             std = (score * (elites - new) ** 2).sum(2, keepdim=True).sqrt()
             std = std.clamp(config.min_std, config.max_std)

@@ -217,8 +217,8 @@ def another_value(f):
     flag = f.name.replace("_", "-")
     if isinstance(f.default, bool):
         return [("no-" if f.default else "") + flag], not f.default
-    if f.metadata["choices"]:
-        value = next(c for c in f.metadata["choices"] if c != f.default)
+    if f.metadata.get("choices"):
+        value = next(c for c in f.metadata.get("choices") if c != f.default)
     else:
         value = f.default + 1 if isinstance(f.default, int) else f.default / 2
     return [flag, str(value)], value
@@ -270,14 +270,14 @@ def refused(done, *parts):
     (["--steps", "0"], ["steps", "at least 1", "0"]),
     (["--batch-size", "0"], ["batch_size", "at least 1"]),
     (["--horizon", "-1"], ["horizon", "at least 0"]),
-    (["--horizon", "500"], ["horizon", "below an episode's 500"]),
+    (["--horizon", "500"], ["horizon", "at most 499"]),
     (["--noise-samples", "1"], ["noise_samples", "at least 2"]),
     (["--noise-std", "nan"], ["noise_std", "nan"]),
     (["--noise-std", "inf"], ["noise_std", "finite"]),
     (["--lr", "0"], ["lr", "above 0"]),
     (["--lr", "inf"], ["lr", "finite"]),
     (["--lam", "inf"], ["lam", "finite"]),
-    (["--held-out", "1"], ["held_out", "between 0 and 0.5"]),
+    (["--held-out", "1"], ["held_out", "above 0 and at most 0.5"]),
     (["--held-out", "0.05"], ["replay.npz", "6 episodes are too few"]),
     (["--kl", "sideways"], ["--kl", "'sideways'", "forward"]),
     (["--preset", "authors"], ["--preset", "'authors'", "paper"]),
@@ -287,9 +287,9 @@ def refused(done, *parts):
     (["--plan-pi-trajs", "-1"], ["pi_trajs", "-1"]),
     (["--plan-min-std", "3"], ["min_std", "max_std"]),
     (["--plan-max-std", "inf"], ["max_std", "finite"]),
-    (["--plan-temperature", "inf"], ["temperature", "finite"]),
-    (["--plan-discount", "1.1"], ["discount", "between 0 and 1"]),
-    (["--plan-momentum", "5"], ["momentum", "between 0 and 1"]),
+    (["--plan-inverse-temperature", "inf"], ["temperature", "finite"]),
+    (["--plan-discount", "1.1"], ["discount", "at most 1"]),
+    (["--plan-momentum", "5"], ["momentum", "at most 1"]),
     (["--episodes", "0"], ["episodes", "at least 1"]),
     (["--workers", "-1"], ["--workers", "-1"]),
     (["--plan-workers", "3"], ["3 workers", "0 to 2"]),

@@ -14,6 +14,7 @@ FORWARD, GRADIENT, ADAM = 1e-5, 1e-4, 1e-5  # relative to the largest entry, or 
 def present(config_class, values):
     """Those settings of a golden file's header that still exist."""
     names = {f.name for f in fac.dataclasses.fields(config_class)}
+    values = {{"temperature": "inverse_temperature"}.get(k, k): v for k, v in values.items()}
     return {k: v for k, v in values.items() if k in names}
 
 

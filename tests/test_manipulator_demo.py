@@ -173,7 +173,7 @@ def test_rewards_are_the_squared_ones():
 def test_table_1():
     config = demo.TABLE_1
     assert (config.iterations, config.samples, config.elites, config.horizon) == (6, 50, 5, 4)
-    assert (config.min_std, config.max_std, config.temperature) == (0.05, 2.0, 0.5)
+    assert (config.min_std, config.max_std, config.inverse_temperature) == (0.05, 2.0, 0.5)
     assert demo.read_options(["--samples", "3"])[1] == replace(config, samples=3, elites=3)
 
 

@@ -30,7 +30,7 @@ def quadratic(target):
     return lambda actions: -((actions - target[..., None]) ** 2).sum((1, 2))
 
 
-CONFIG = fac.PlannerConfig(samples=512, iterations=20, temperature=2.0, min_std=0.01)
+CONFIG = fac.PlannerConfig(samples=512, iterations=20, inverse_temperature=2.0, min_std=0.01)
 
 
 @pytest.mark.parametrize("n, d", [(1, 3), (3, 1), (2, 2)])
@@ -64,7 +64,7 @@ def test_elites_are_the_best_of_each_agent():
         best = np.argsort(-G[i])[:5]
         assert sorted(map(tuple, elites[i][..., :].reshape(3, -1).T.tolist())) == \
             sorted(map(tuple, actions[i][..., best].reshape(3, -1).T.tolist()))
-        score = np.exp(config.temperature * (np.sort(G[i])[::-1][:5] - G[i].max()))
+        score = np.exp(config.inverse_temperature * (np.sort(G[i])[::-1][:5] - G[i].max()))
         assert np.allclose(np.sort(weights[i])[::-1], score / score.sum(), atol=1e-6)
 
 
@@ -186,8 +186,9 @@ def test_an_observation_of_the_wrong_size_is_refused():
 def test_planner_config_refuses_nonsense():
     for wrong, text in (({"elites": 9, "samples": 8}, "elites"), ({"horizon": -1}, "horizon"),
                         ({"min_std": 3.0}, "min_std"), ({"output": "best"}, "output"),
-                        ({"temperature": np.inf}, "finite"), ({"max_std": np.inf}, "finite"),
-                        ({"discount": 1.1}, "between 0 and 1"), ({"momentum": np.nan}, "momentum")):
+                        ({"inverse_temperature": np.inf}, "finite"),
+                        ({"max_std": np.inf}, "finite"), ({"momentum": np.nan}, "momentum"),
+                        ({"discount": 1.1}, "at least 0 and at most 1")):
         with pytest.raises(fac.UserError, match=text):
             fac.PlannerConfig(**wrong)
     assert fac.PlannerConfig().num_elites == 64
