@@ -714,7 +714,7 @@ def test_fuzz(tmp_path, kind, capsys):
     errors = capsys.readouterr().err
     assert errors.count("import_expert.py: error: ") == counts[2] and "Traceback" not in errors
     assert highest < 32 * MIB
-    assert counts[2] and (counts[0] or not complete)
+    assert counts[2] and (counts[0] or not complete or FUZZ < 250)
     assert {p.name for p in tmp_path.iterdir()} <= {"in", "out"}
     assert {p.name for p in (tmp_path / "in").iterdir()} <= {f"model{suffix}", path.name}
     assert not counts[0] or {p.name for p in (tmp_path / "out").iterdir()} == {"expert.npz"}
