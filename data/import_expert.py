@@ -1,0 +1,496 @@
+#!/usr/bin/env python3
+"""Make an expert for `distill --expert DIR` from a TD-MPC checkpoint, without PyTorch.
+
+    python data/import_expert.py model.pt --task walker-walk --out imported --collect 40
+
+It reads official TD-MPC `.pt` files ({"model": ..., "model_target": ...} or a bare state dict) and
+the same names in a `.safetensors` or an `.npz`; float64, float32, float16 and bfloat16 (not .npz).
+DIR gets expert.npz and, with --replay (arrays that you have) or --collect (episodes that the expert
+plays now), replay.npz. The expert must read dm_control's observation dict in its own order and
+decide every second control step, as everything here does.
+
+A file is data, whoever made it. A `.pt` is a zip around a pickle, and a pickle is a program:
+`read_pickle` knows the opcodes and names that a state dict is made of and refuses all others, so
+nothing in it can be run, imported or written. What a file declares (members, sizes, offsets,
+strides) is checked against the bytes that it has. Memory stays below three times the unpacked
+file (MAX_BYTES, MAX_RATIO), 12 bytes a weight (MAX_WEIGHTS) and 32 MiB.
+"""
+import argparse
+import contextlib
+import dataclasses
+import io
+import json
+import math
+import pickletools
+import re
+import sys
+import zipfile
+from collections import namedtuple
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+import fac_tdmpc_ref as fac  # noqa: E402
+
+MAX_BYTES = 1 << 29  # of a file, unpacked; a checkpoint with Table 2's sizes has 13 MB
+MAX_RATIO = 50  # unpacked bytes for each packed one, beyond the first MAX_PIECE
+MAX_PIECE = 1 << 20  # that is read of a zip at once
+MAX_MEMBERS = 4096  # of a zip
+MAX_HEADER = 1 << 17  # bytes of data.pkl, or of a safetensors header; a checkpoint's has 10,000
+MAX_WEIGHTS = 1 << 25
+MAX_RANK = 8
+MAX_NOISE = 0.5  # largest deviation of the noise on collected actions
+LEAST_EPISODES = 20  # distill holds out one in 20
+RESAVE = "torch.load it with weights_only=True and torch.save its state dict alone"
+ELSEWHERE = "only TD-MPC's official state dicts, for state input, can be imported"
+
+
+def need(true, what):
+    """UserError if something isn't as it must be."""
+    if not true:
+        raise fac.UserError(what)
+
+
+def short(text):
+    """A name out of a file, fit for a message: escaped, and not long."""
+    return ascii(str(text)[:60])
+
+
+# ---------------------------------------------------------------------------- zip and .npz
+
+class BoundedFile(io.FileIO):
+    """A file that gives no more than MAX_PIECE at once: zipfile trusts declared sizes."""
+
+    def read(self, size=-1):
+        found = super().read(MAX_PIECE + 1 if size < 0 else min(size, MAX_PIECE + 1))
+        need(len(found) <= MAX_PIECE, "the zip's table of contents is too large")
+        return found
+
+
+def read_zip(path):
+    """{name: bytes} of a zip's members; nothing is unpacked before the limits are checked."""
+    size, found = path.stat().st_size, {}
+    limit = min(MAX_BYTES, MAX_PIECE + MAX_RATIO * size)
+    try:
+        with BoundedFile(path) as file, zipfile.ZipFile(file) as archive:
+            members = archive.infolist()
+            total = sum(m.file_size for m in members)
+            need(len(members) <= MAX_MEMBERS and total <= limit, f"{len(members)} members that "
+                 f"unpack to {total} bytes; expected at most {MAX_MEMBERS} and {limit}")
+            need(all(m.compress_type in (0, 8) and not m.flag_bits & 1 for m in members),
+                 "encrypted, or packed with something else than deflate; pack it anew")
+            for m in members:
+                need(m.filename not in found, f"{short(m.filename)}: two members of this name")
+                found[m.filename] = unpack(archive, m)
+    except (fac.UserError, MemoryError):
+        raise
+    except Exception as error:  # a damaged file can raise nearly anything
+        raise fac.UserError(f"not a readable zip archive ({short(error)})") from None
+    return found
+
+
+def unpack(archive, member):
+    """A member's bytes, never more than it declares; zipfile checks their CRC."""
+    data = bytearray()
+    with archive.open(member) as source:
+        while piece := source.read(MAX_PIECE):
+            data += piece
+    need(len(data) == member.file_size, f"{short(member.filename)}: ends early")
+    return data
+
+
+NPY = re.compile(rb"\x93NUMPY\x01\x00(..)\{'descr': '([<>|](?:f[248]|b1))', 'fortran_order': "
+                 rb"(True|False), 'shape': \((\d{1,9}(?:, \d{1,9})*),?\), \} *\n", re.DOTALL)
+
+
+def read_npz(path):
+    """{name: array} of an .npz. Headers are matched, not evaluated."""
+    found = {}
+    for name, data in read_zip(path).items():
+        name, match = name.removesuffix(".npy"), NPY.match(data)
+        if name == "header":  # in this project's own files
+            continue
+        need(match and match.end() == 10 + int.from_bytes(match[1], "little"),
+             f"{short(name)}: expected an array of floats or bools, as numpy.savez writes it")
+        shape, dtype = [int(n) for n in match[4].split(b", ")], np.dtype(match[2].decode())
+        need(0 < math.prod(shape) * dtype.itemsize == len(data) - match.end() and
+             len(shape) <= MAX_RANK, f"{short(name)}: declares {dtype} {shape[:MAX_RANK]}, holds "
+             f"{len(data) - match.end()} bytes")
+        found[name] = np.ndarray(shape, dtype, data, match.end(),
+                                 order="F" if match[3] == b"True" else "C")
+    return found
+
+
+# ------------------------------------------------------------------------------------- .pt
+
+Global = namedtuple("Global", "name")  # what a pickle asks for; it stays a name
+Storage = namedtuple("Storage", "data dtype")  # a tensor's memory: a member's bytes
+
+# NumPy has no bfloat16: unsigned integers, which are read for nothing else, stand for it
+STORAGES = {"torch DoubleStorage": "f8", "torch FloatStorage": "f4", "torch HalfStorage": "f2",
+            "torch BFloat16Storage": "u2", "torch LongStorage": "i8"}
+OPCODES = set("""PROTO NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 BINUNICODE EMPTY_DICT MARK
+EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 BINPUT LONG_BINPUT BINGET LONG_BINGET SETITEM SETITEMS BUILD
+GLOBAL REDUCE BINPERSID""".split())
+CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
+
+
+def read_pt(path):
+    """What torch.save wrote: {name: array, or a dict of them}."""
+    with open(path, "rb") as file:
+        need(file.read(2) == b"PK", f"no zip: older than PyTorch 1.6, or not PyTorch's; {RESAVE}")
+    members = read_zip(path)
+    roots = [n[:-8] for n in members if re.fullmatch(r"([^/]+/)?data\.pkl", n)]
+    need(len(roots) == 1, f"expected one data.pkl, found {len(roots)}; {RESAVE}")
+    inside = {n.removeprefix(roots[0]): d for n, d in members.items() if n.startswith(roots[0])}
+    order = {b"little": "<", b"big": ">"}.get(bytes(inside.get("byteorder", b"little")))
+    need(order, "byteorder: expected little or big")
+    try:
+        return read_pickle(inside["data.pkl"], inside, order)
+    except fac.UserError as error:
+        raise fac.UserError(f"data.pkl {error}; that is not a state dict of weights alone, and "
+                            f"nothing of it was run; {RESAVE}") from None
+    except (ValueError, IndexError, KeyError):
+        raise fac.UserError("data.pkl is damaged; copy or save the file anew") from None
+
+
+def read_pickle(data, members, byteorder):
+    """The dict that a state dict's pickle describes, built opcode by opcode; nothing is called.
+
+    Values are None, bool, int, str, tuple, dict, Global, Storage, and arrays that are views of a
+    member's bytes. An opcode makes one at most, so `data` bounds them all; types are compared
+    before anything is done to a value, only str is hashed, and nothing recurs.
+    """
+    need(len(data) <= MAX_HEADER, f"has {len(data)} bytes, more than {MAX_HEADER}")
+    stack, below, memo = [], [], {}  # below: the stacks beneath each MARK
+    for name, argument in opcodes(io.BytesIO(data)):
+        match name:
+            case "PROTO":
+                need(argument == 2, "has another protocol than 2")
+            case "NONE" | "NEWTRUE" | "NEWFALSE" | "EMPTY_TUPLE":
+                stack.append(CONSTANTS[name])
+            case "BININT" | "BININT1" | "BININT2" | "BINUNICODE":
+                stack.append(argument)
+            case "EMPTY_DICT":
+                stack.append({})
+            case "MARK":
+                below.append(stack)
+                stack = []
+            case "TUPLE":
+                items, stack = tuple(stack), below.pop()
+                stack.append(items)
+            case "TUPLE1" | "TUPLE2" | "TUPLE3":
+                start = len(stack) - int(name[-1])
+                need(start >= 0, "takes what isn't there")
+                stack[start:] = [tuple(stack[start:])]
+            case "BINPUT" | "LONG_BINPUT":
+                memo[argument] = stack[-1]
+            case "BINGET" | "LONG_BINGET":
+                stack.append(memo[argument])
+            case "SETITEM":
+                set_items(stack[-3], [stack.pop(-2), stack.pop()])
+            case "SETITEMS":
+                items, stack = stack, below.pop()
+                set_items(stack[-1], items)
+            case "BUILD":  # the `_metadata` of a state dict, which nobody needs
+                need([type(x) for x in stack[-2:]] == [dict, dict], "sets a state")
+                stack.pop()
+            case "GLOBAL":
+                need(argument in STORAGES or argument in FUNCTIONS, f"asks for {short(argument)}")
+                stack.append(Global(argument))
+            case "REDUCE":
+                stack.append(reduce(stack.pop(-2), stack.pop()))
+            case "BINPERSID":
+                stack.append(find_storage(stack.pop(), members, byteorder))
+    need(not below and [type(x) for x in stack] == [dict], "holds something else than a dict")
+    return stack[0]
+
+
+def opcodes(stream):
+    """(name, argument) of a pickle's opcodes up to STOP; others than OPCODES aren't even read."""
+    while code := stream.read(1):
+        opcode = pickletools.code2op.get(code.decode("latin-1"))
+        name = opcode.name if opcode else repr(code)
+        if name == "STOP":
+            return
+        need(name in OPCODES, f"has the opcode {name}")
+        if name == "GLOBAL":  # the reader would interpret escapes
+            yield name, " ".join(stream.readline(99).decode().rstrip("\n") for _ in range(2))
+        else:
+            yield name, opcode.arg.reader(stream) if opcode.arg else None
+    need(False, "ends early")
+
+
+def set_items(target, items):
+    """A dict's next names and values."""
+    need(type(target) is dict and not len(items) % 2 and all(type(k) is str for k in items[::2]),
+         "sets other items than a dict's, by names")
+    target.update(zip(items[::2], items[1::2]))
+
+
+def reduce(function, arguments):
+    """What an allowed name stands for, of arguments that are checked there."""
+    need(type(function) is Global and type(arguments) is tuple and function.name in FUNCTIONS and
+         len(arguments) in FUNCTIONS[function.name][1:], "calls something")
+    return FUNCTIONS[function.name][0](*arguments)
+
+
+def find_storage(found, members, byteorder):
+    """A persistent id: ("storage", type, key, device, number of elements)."""
+    need(type(found) is tuple and [type(x) for x in found[:6]] == [str, Global, str, str, int] and
+         found[0] == "storage", "refers to something")
+    _, kind, key, _, count = found
+    data, dtype = members[f"data/{key}"], np.dtype(byteorder + STORAGES[kind.name])
+    need(count * dtype.itemsize == len(data), f"declares {count} elements of {dtype.itemsize} "
+         f"bytes for storage {short(key)}, which has {len(data)} bytes")
+    return Storage(data, dtype)
+
+
+def rebuild_tensor(storage, offset, size, stride, _grad, _hooks, metadata=None):
+    """A view of a storage that stays inside it."""
+    need(type(storage) is Storage and type(size) is tuple and type(stride) is tuple and
+         len(size) == len(stride) <= MAX_RANK and metadata is None and
+         all(type(n) is int and n >= 0 for n in (offset, *size, *stride)), "has an odd tensor")
+    width = storage.dtype.itemsize
+    last = offset + sum((n - 1) * step for n, step in zip(size, stride))
+    need(0 < math.prod(size) <= MAX_WEIGHTS and (last + 1) * width <= len(storage.data),
+         "has a tensor that is empty, too large, or reaches out of its storage")
+    return np.ndarray(size, storage.dtype, storage.data, offset * width,
+                      [step * width * (n > 1) for n, step in zip(size, stride)])
+
+
+FUNCTIONS = {"collections OrderedDict": (dict, 0),  # and how many arguments they take
+             "torch._utils _rebuild_tensor_v2": (rebuild_tensor, 6, 7),
+             "torch._utils _rebuild_parameter": (lambda tensor, _grad, _hooks: tensor, 3)}
+
+
+# ---------------------------------------------------------------------------- .safetensors
+
+def read_safetensors(path):
+    """{name: array} of a .safetensors file, by way of that library."""
+    try:
+        from safetensors import deserialize
+    except ImportError:
+        raise fac.UserError("needs a library: pip install 'fac-tdmpc-ref[safetensors]'") from None
+    need(path.stat().st_size <= MAX_BYTES, f"expected at most {MAX_BYTES} bytes")
+    data = path.read_bytes()
+    need(int.from_bytes(data[:8], "little") <= MAX_HEADER,
+         f"not a safetensors file, or one with a header of more than {MAX_HEADER} bytes")
+    try:
+        found = deserialize(data)
+    except Exception as error:  # the library's own, mostly
+        raise fac.UserError(f"not a readable safetensors file ({short(error)})") from None
+    kinds = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "BF16": "<u2"}
+    for name, t in found:
+        need(t["dtype"] in kinds and len(t["shape"]) <= MAX_RANK and t["data"], f"{short(name)}: "
+             f"expected {', '.join(kinds)}, found {t['dtype']} {t['shape'][:MAX_RANK]}")
+    return {name: np.ndarray(t["shape"], kinds[t["dtype"]], t["data"]) for name, t in found}
+
+
+# ------------------------------------------------------------------------------ the expert
+
+READERS = {".pt": read_pt, ".pth": read_pt, ".npz": read_npz, ".safetensors": read_safetensors}
+
+
+@contextlib.contextmanager
+def reading(path, kinds=tuple(READERS)):
+    """What a file holds, found by the end of its name; every UserError inside begins with it."""
+    try:
+        need(Path(path).is_file() and Path(path).suffix in kinds,
+             f"no such file, or its name doesn't end in {', '.join(kinds)}")
+        yield READERS[Path(path).suffix](Path(path))
+    except fac.UserError as error:
+        raise fac.UserError(f"{path}: {error}") from None
+    except OSError as error:
+        raise fac.UserError(f"{path}: can't be read: {error.strerror or error}") from None
+
+
+def state_dict(found):
+    """The weights in what a file holds: {name: array} of `model` if it has that, or of all."""
+    flat = {}
+    for key, value in found.items():
+        flat.update({f"{key}.{k}": v for k, v in value.items()} if type(value) is dict
+                    else {key: value})
+    if any(key.startswith("model.") for key in flat):
+        flat = {k.removeprefix("model."): v for k, v in flat.items()
+                if not k.startswith("model_target.")}
+    return flat
+
+
+def find_sizes(state):
+    """The ModelConfig that three of the weights' shapes tell."""
+    shapes = []
+    for key, meaning in (("_encoder.0.weight", "(hidden, dim O)"),
+                         ("_encoder.2.weight", "(latent, hidden)"),
+                         ("_dynamics.0.weight", "(hidden, latent + dim A)")):
+        shape = getattr(state.get(key), "shape", "nothing")
+        least = shapes[1][0] if len(shapes) == 2 else 0
+        need(len(shape) == 2 and shape[1] > least,
+             f"{key}: expected a matrix {meaning}, found {shape}; {ELSEWHERE}")
+        shapes.append(shape)
+    (enc, dim_obs), (latent, _), (hidden, joint) = shapes
+    return fac.ModelConfig(dim_obs, joint - latent, 1, latent, enc, hidden)
+
+
+def find_expert(path, task):
+    """(sizes, {TD-MPC's name: float32 weight}, types in the file) of a checkpoint."""
+    with reading(path) as found:
+        state, expected = state_dict(found), {}
+        sizes = find_sizes(state)
+        fac.check_task(sizes, task)
+        for name, i, kind, shape, _ in fac.layers(sizes, any(k.startswith("_pi.") for k in state)):
+            expected[f"{name}.{i}.weight"] = shape[1:] if kind == "linear" else shape[1:2]
+            expected[f"{name}.{i}.bias"] = shape[1:2]
+        for key in state:
+            need(key in expected, f"{short(key)}: unknown entry; {ELSEWHERE}")
+        need(sum(map(math.prod, expected.values())) <= MAX_WEIGHTS,
+             f"expected at most {MAX_WEIGHTS} weights, found more")
+        weights = {key: as_float32(key, state.get(key), shape) for key, shape in expected.items()}
+        kinds = {state[key].dtype.newbyteorder("=").name for key in expected}
+    return sizes, weights, sorted("bfloat16" if kind == "uint16" else kind for kind in kinds)
+
+
+def as_float32(key, value, shape):
+    """A weight as the module keeps it; UserError if it is of another shape or kind."""
+    found = (f"{value.dtype} {value.shape}" if type(value) is np.ndarray else
+             "nothing" if value is None else type(value).__name__)
+    need(type(value) is np.ndarray and value.dtype.kind in "fu" and value.shape == shape,
+         f"{key}: expected floats {shape}, found {found}; {ELSEWHERE}")
+    with np.errstate(over="ignore"):
+        value = np.ascontiguousarray(widened(value), np.float32)
+    need(np.isfinite(value).all(), f"{key}: holds values that are not finite in float32; choose "
+         f"a checkpoint from before its run diverged")
+    return value
+
+
+def widened(value):
+    """bfloat16, for which unsigned integers stand, as float32; all else as it is."""
+    return (value.astype(np.uint32) << 16).view(np.float32) if value.dtype.kind == "u" else value
+
+
+# ------------------------------------------------------------------------------ the replay
+
+def find_replay(path, sizes):
+    """What replay.npz needs, from an .npz that holds it in any precision."""
+    with reading(path, (".npz",)) as found:
+        rows = found["continues"].size if "continues" in found else 0
+        for key, kind, shape in (("continues", "bool", (rows,)),
+                                 ("observation", "float", (rows, sizes.dim_obs)),
+                                 ("action", "float", (rows, sizes.dim_action))):
+            have = f"{found[key].dtype} {found[key].shape}" if key in found else "nothing"
+            need(have.startswith(kind) and found[key].shape == shape,
+                 f"{key}: expected {kind} {shape}, found {have}")
+        continues = found["continues"]
+        with np.errstate(over="ignore"):
+            observation = found["observation"].astype(np.float16)
+            action = np.where(continues[:, None], found["action"], 0).astype(np.float16)
+        need(not continues[-1] and np.isfinite(observation).all() and (abs(action) <= 1).all(),
+             "expected continues False in the last row, observations that float16 can hold, and "
+             "actions in [-1, 1]")
+    return {"observation": observation, "action": action, "continues": continues}
+
+
+def collect(model, environment, episodes, seed):
+    """A buffer of episodes that the model plays, each with noise of another deviation."""
+    planning = fac.PlannerConfig(samples=128, iterations=4)  # takes a fifth of the default's time
+    decisions = episodes * fac.EPISODE_STEPS
+    buffer = fac.ReplayBuffer(environment.dim_obs, environment.dim_action, decisions)
+    with fac.Planner(model, planning) as planner, \
+            fac.progress("collecting", decisions, "decision") as bar:
+        for i in range(episodes):
+            rng = np.random.default_rng([seed, i])
+            std, start = rng.uniform(0, MAX_NOISE), int(rng.integers(2 ** 31))
+            planner.reset(start)
+            observation, action, reward = [environment.reset(start)], [], []
+            for noise in std * rng.standard_normal((fac.EPISODE_STEPS, environment.dim_action)):
+                action.append(np.clip(planner.act(observation[-1]) + noise, -1, 1))
+                for history, value in zip((observation, reward), environment.step(action[-1])):
+                    history.append(value)
+                bar.update()
+            buffer.add(observation, action, reward)
+    return buffer
+
+
+# ---------------------------------------------------------------------------- command line
+
+def run(args):
+    """Read everything, then write; returns what --json prints."""
+    need(args.collect is None or args.collect > 1, f"--collect must be at least 2, better "
+         f"{LEAST_EPISODES}: distill holds out an episode in {LEAST_EPISODES}; not {args.collect}")
+    fac.lookup_task(args.task)
+    environment = fac.Environment(args.task) if args.collect else None  # missed now, if missing
+    sizes, weights, kinds = find_expert(args.file, args.task)
+    arrays = find_replay(args.replay, sizes) if args.replay else None
+    out, about = Path(args.out), {"task": args.task, "imported_from": Path(args.file).name}
+    fac.write_npz(out / "expert.npz",
+                  {"kind": "expert", "model": dataclasses.asdict(sizes), **about}, weights)
+    result = {"task": args.task, "file": args.file, "out": args.out, "stored_as": kinds,
+              "weights": sum(w.size for w in weights.values()), "policy": "_pi.0.weight" in weights,
+              "model": dataclasses.asdict(sizes), "episodes": 0, "transitions": 0, "returns": None}
+    if arrays:
+        fac.write_npz(out / "replay.npz", {"kind": "replay", **about}, arrays, compress=True)
+    elif environment:
+        model, _ = fac.load_model(out / "expert.npz")
+        buffer = collect(model, environment, args.collect, args.seed)
+        buffer.write(out / "replay.npz", about)
+        result["returns"] = [float(r) for r in buffer.reward.sum(1)]
+    if arrays or environment:
+        replay = fac.Replay(out / "replay.npz")
+        result.update(episodes=len(replay.ends), transitions=replay.transitions)
+    return result
+
+
+def report(result):
+    """What was imported, and what to do about what is missing."""
+    sizes, episodes, returns = result["model"], result["episodes"], result["returns"]
+    lines = [f"{result['out']}: {result['weights']:,} weights ({', '.join(result['stored_as'])}), "
+             f"latent {sizes['latent_dim']}, hidden {sizes['enc_dim']} and {sizes['mlp_dim']}; "
+             f"{result['transitions']:,} transitions in {episodes} episodes"]
+    if returns:
+        lines += [f"return {np.mean(returns):.0f} ± {np.std(returns):.0f}, with noise of up to "
+                  f"{MAX_NOISE} on the actions"]
+    if not result["policy"]:
+        lines += ["no policy (_pi): planning goes without its proposals, which costs the expert "
+                  "return; distilling doesn't need it"]
+    if not episodes:
+        lines += [f"distill needs --replay FILE beside --expert {result['out']}/expert.npz, or run "
+                  f"this again with --collect {LEAST_EPISODES}"]
+    elif episodes < LEAST_EPISODES:
+        lines += [f"distill holds out one episode in {LEAST_EPISODES}, of {episodes} none: give it "
+                  f"--held-out {min(0.5, 1 / episodes):.2f}, or more episodes"]
+    return "\n".join(lines)
+
+
+def main(argv=None):
+    """Run the command line; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("file", metavar="FILE", help="checkpoint: " + ", ".join(READERS))
+    parser.add_argument("--task", required=True, help="one of: " + ", ".join(fac.TASKS))
+    parser.add_argument("--out", required=True, help="folder for expert.npz and replay.npz")
+    data = parser.add_mutually_exclusive_group()
+    data.add_argument("--replay", help="an .npz with observation (M, dim O), action (M, dim A) and "
+                      "continues (M,), False in each episode's last row")
+    data.add_argument("--collect", type=int, metavar="N", help="have the expert play N episodes")
+    parser.add_argument("--seed", type=fac.natural, default=0, help="of these episodes [0]")
+    parser.add_argument("--json", action="store_true",
+                        help="print one JSON object as the last line of stdout")
+    try:
+        args = parser.parse_args(argv)
+        result = run(args)
+    except SystemExit as stop:  # --help, or a flag that isn't one
+        return stop.code
+    except (fac.UserError, MemoryError) as error:
+        print(f"import_expert.py: error: {str(error) or 'not enough memory'}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("import_expert.py: interrupted", file=sys.stderr)
+        return 130
+    print(report(result), file=sys.stderr)
+    if args.json:
+        print(json.dumps(result))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
