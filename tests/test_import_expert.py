@@ -756,8 +756,7 @@ def test_a_replay_is_converted_and_distils(tmp_path, dtype, capsys):
     again = fac.Replay(tmp_path / "out" / "replay.npz")
     assert first and np.array_equal(again.action, replay.action)
     expert, _ = fac.load_model(tmp_path / "out" / "expert.npz")
-    distiller = fac.Distiller(expert, again, fac.DistillConfig(steps=2, batch_size=4,
-                                                               own_episodes=0))
+    distiller = fac.Distiller(expert, again, fac.DistillConfig(steps=2, batch_size=4))
     assert all(np.isfinite(distiller.step()))
     distiller.close()
 
