@@ -35,6 +35,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import copy
 import csv
 import dataclasses
 import difflib
@@ -132,13 +133,15 @@ class ModelConfig(Settings):
 @dataclass(frozen=True)
 class PlannerConfig(Settings):
     """MPPI. Raises UserError for values that can't plan."""
-    samples: int = field(512, "S: action sequences drawn in an iteration (Table 2)", least=1)
-    iterations: int = field(6, "refinements of the proposal in a decision (Table 2)", least=1)
+    samples: int = field(128, "S: action sequences drawn in an iteration [D10]", paper=512, least=1)
+    iterations: int = field(4, "refinements of the proposal in a decision [D10]", paper=6, least=1)
     elites: int = field(0, "sequences that refine the proposal; 0: samples / 8 (Table 2: 64)",
                        least=0)
     pi_trajs: int = field(24, "policy proposals, where the model has a policy (Table 2)", least=0)
     horizon: int = field(3, "H of Equation 2: H rewards, then Q of action H + 1; 0: Q alone "
                          "(Table 2)", least=0, most=EPISODE_STEPS - 1)
+    q_alone: int = field(0, "decisions of every 200, the first, that Q alone plans (H = 0) [D5]",
+                         least=0, most=200)
     discount: float = field(0.99, "gamma, where the model's file names no other (Table 2)",
                             least=0, most=1)
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)", above=0)
@@ -170,7 +173,7 @@ class PlannerConfig(Settings):
 @dataclass(frozen=True)
 class DistillConfig(Settings):
     """Algorithm 1. `--preset paper` takes each field's paper value."""
-    steps: int = field(20_000, "gradient steps [D1]", paper=100_000, least=1)
+    steps: int = field(12_000, "gradient steps [D1]", paper=100_000, least=1)
     batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=1)
     noise_samples: int = field(5, "K: perturbations of each action (section 4.4) [D1]", paper=10,
                                least=2)
@@ -183,6 +186,9 @@ class DistillConfig(Settings):
                        "predictions are computed once [D1]", paper=1, least=1)
     horizon: int = field(3, "H: the loss sums over h = 0..H, planning looks as far (Table 2)",
                          least=0, most=EPISODE_STEPS - 1)
+    q_alone: int = field(50, "decisions of every 200, the first, that the student's Q alone plans "
+                         "(H = 0), lest it stays where its rollouts hold it [D5]", paper=0,
+                         least=0, most=200)
     lam: float = field(1.0, "lambda: weight of step h is lambda^h (rho in Table 2) [D5]", paper=0.5,
                        least=0)
     reward_coef: float = field(0.5, "weight of the rewards' divergence (Table 2)", least=0)
@@ -204,6 +210,11 @@ class DistillConfig(Settings):
                        choices=("table2", "section51"))
     new_targets: float = field(0.5, "reacher only: share of states whose target is drawn anew, as "
                                "the task draws it [D7]", paper=0.0, least=0, most=1)
+    own_episodes: int = field(16, "episodes that the student plays after each of the first three "
+                              "quarters of the steps; their states join the replay's [D9]",
+                              paper=0, least=0)
+    own_share: float = field(0.25, "share of states from the student's own episodes [D9]",
+                             paper=0.0, least=0, most=1)
     held_out: float = field(0.05, "share of episodes held out for the rank correlation",
                             above=0, most=0.5)
 
@@ -906,7 +917,8 @@ class Distiller:
             raise UserError(f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, "
                             f"{replay.dim_action}), the expert expects ({sizes.dim_obs}, "
                             f"{sizes.dim_action}); pass the replay of the expert's task")
-        self.expert, self.replay, self.config, self.seed = expert, replay, config, seed
+        self.expert, self.config, self.seed = expert, config, seed
+        self.replay, self.own_starts = copy.copy(replay), np.zeros(0, int)  # own episodes join it
         agents = sizes.dim_action if num_agents is None else num_agents
         with one_thread():
             self.optimizer, self.student = new_student(expert, agents, config, seed)
@@ -923,8 +935,11 @@ class Distiller:
         rng, parts = stream(self.seed, "pool", number), []
         reacher = str(self.replay.header.get("task")).startswith("reacher")
         for size in np.diff(np.r_[0:self.pool_size:256, self.pool_size]):  # what fits the cache
-            obs, actions = self.replay.sequences(rng.choice(self.train_starts, size),
-                                                 self.config.horizon + 1)
+            starts = rng.choice(self.train_starts, size)
+            if len(self.own_starts):  # [D9]
+                own = rng.random(size) < self.config.own_share
+                starts[own] = rng.choice(self.own_starts, own.sum())
+            obs, actions = self.replay.sequences(starts, self.config.horizon + 1)
             if reacher:  # [D7]
                 chosen = rng.random(size) < self.config.new_targets
                 obs[3:5, chosen] = new_targets(obs[:, chosen], rng)
@@ -976,13 +991,36 @@ class Distiller:
         """Steps made so far."""
         return self.optimizer.adam.t
 
+    @property
+    def episodes_due(self):
+        """How many episodes the student is still to play before the next step [D9]."""
+        quarter = 4 * self.t // self.config.steps
+        return quarter * self.config.own_episodes - len(self.own_starts) // self._own_length
+
+    @property
+    def _own_length(self):
+        """Starts in an episode of the student's own."""
+        return EPISODE_STEPS - self.config.horizon
+
+    def add(self, observation, action):
+        """Let episodes (E, T, O), (E, T, A) that the student played join the data [D9]."""
+        begins = len(self.replay.observation) + EPISODE_STEPS * np.arange(len(action))[:, None]
+        self.replay.extend(observation, action)
+        self.own_starts = np.r_[self.own_starts, (begins + np.arange(self._own_length)).ravel()]
+        self._number = None  # its pool is drawn again, with them
+
     def state(self):
         """Everything that a resumed run needs."""
-        return self.optimizer.state()
+        count = len(self.own_starts) // self._own_length
+        observation, action = (x[len(x) - count * EPISODE_STEPS:].reshape(
+            count, EPISODE_STEPS, x.shape[1]) for x in (self.replay.observation,
+                                                        self.replay.action))
+        return {**self.optimizer.state(), "own_observation": observation, "own_action": action}
 
     def load(self, state):
-        """Go on from a `state`."""
+        """Go on from a `state`, before any step."""
         self.optimizer.load(state)
+        self.add(state["own_observation"], state["own_action"])
 
     def close(self):
         """Stop the threads and give BLAS its own back."""
@@ -1245,32 +1283,38 @@ class AgentPlanner:
     def reset(self, seeds):
         """Forget the warm start; seeds: one SeedSequence for each agent, [] to keep streams."""
         sizes = self.model.config
-        self.mean = np.zeros((sizes.num_agents, self.config.horizon + 1, sizes.agent_actions), F32)
+        self.t, self.mean = 0, np.zeros((sizes.num_agents, self.config.horizon + 1,
+                                         sizes.agent_actions), F32)
         if len(seeds):
             self.rngs = [np.random.Generator(np.random.SFC64(s)) for s in seeds]
 
     def plan(self, z):
         """z (N, m, 1) -> the agents' first actions (N, d); keeps the warm start."""
         config = self.config
+        if self.t % 200 < config.q_alone:  # [D5]
+            config = dataclasses.replace(config, horizon=0)
+        self.t += 1
         returns = (self.returns.start(z, config) if self.returns else
                    functools.partial(h_step_return, self.model, z, config=config))
-        mean, elites, scores = mppi(returns, self.mean, config, self.rngs, self._proposals(z))
-        self.mean[:, :-1], self.mean[:, -1] = mean[:, 1:], 0
+        start = np.ascontiguousarray(self.mean[:, :config.horizon + 1])
+        mean, elites, scores = mppi(returns, start, config, self.rngs, self._proposals(z, config))
+        self.mean[:] = 0
+        self.mean[:, :config.horizon] = mean[:, 1:]
         if config.output == "mean":
             return mean[:, 0]
         pick = [min(np.searchsorted(np.cumsum(p), rng.random(), "right"), len(p) - 1)
                 for p, rng in zip(scores, self.rngs)]
         return np.stack([e[0, :, i] for e, i in zip(elites, pick)])
 
-    def _proposals(self, z):
+    def _proposals(self, z, config):
         """Noisy policy rollouts (1, L, A, P), where there is a policy (TD-MPC's code)."""
-        if not (self.model.has_policy and self.config.pi_trajs):
+        if not (self.model.has_policy and config.pi_trajs):
             return None
-        z, actions = np.repeat(z, self.config.pi_trajs, 2), []
-        for h in range(self.config.horizon + 1):
+        z, actions = np.repeat(z, config.pi_trajs, 2), []
+        for h in range(config.horizon + 1):
             mu = self.model.policy(z)
             actions.append(np.clip(mu + policy_noise(mu.shape, self.rngs[0]), -1, 1))
-            if h < self.config.horizon:
+            if h < config.horizon:
                 z = self.model.next(z, actions[-1])
         return np.stack(actions, 1)
 
@@ -1322,11 +1366,11 @@ class Planner:
     @property
     def warm_start(self):
         """What an episode hands to its next decision, where all is planned in this process."""
-        return self._own.mean, self._own.rngs
+        return self._own.mean, self._own.rngs, self._own.t
 
     @warm_start.setter
     def warm_start(self, state):
-        self._own.mean, self._own.rngs = state
+        self._own.mean, self._own.rngs, self._own.t = state
 
     def act(self, obs):
         """obs (O,), anything that converts to float32 -> action (A,) float32 in [-1, 1]."""
@@ -1860,6 +1904,12 @@ class Replay:
     def transitions(self):
         return len(self.observation) - len(self.ends)
 
+    def extend(self, observation, action):
+        """Add rows of whole episodes: (E, T, O), (E, T, A); `starts` doesn't know them."""
+        self.observation, self.action = (
+            np.concatenate([old, new.reshape(-1, old.shape[1]).astype(np.float16)])
+            for old, new in ((self.observation, observation), (self.action, action)))
+
     def starts(self, steps, held_out):
         """Rows from which `steps` actions stay in their episode: (training, held-out) rows.
 
@@ -1972,15 +2022,17 @@ def data_file(task, name):
 
 
 def run_episode(environment, planner, seed):
-    """Plan through the episode of `seed`; yields (reward, planning seconds) of each decision."""
+    """Plan through the episode of `seed`; yields each decision's (observation, action, reward,
+    seconds of planning)."""
     planner.reset(seed)
     obs = environment.reset(seed)
     for _ in range(EPISODE_STEPS):
         begin = time.perf_counter()
         action = planner.act(obs)
         seconds = time.perf_counter() - begin
-        obs, reward = environment.step(action)
-        yield reward, seconds
+        after, reward = environment.step(action)
+        yield obs, action, reward, seconds
+        obs = after
 
 
 def _evaluation_worker(connection):
@@ -2020,9 +2072,9 @@ def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="eval
                                  [0] * episodes)
     with progress(label, episodes * EPISODE_STEPS, "decision") as bar:
         for i, part in _decisions(model, task, config, seeds, workers):
-            rewards[i, decided[i]:decided[i] + len(part)] = [reward for reward, _ in part]
+            rewards[i, decided[i]:decided[i] + len(part)] = [reward for *_, reward, _ in part]
             decided[i] += len(part)
-            seconds[i] += sum(s for _, s in part)
+            seconds[i] += sum(s for *_, s in part)
             bar.update(len(part))
             if bar.n >= EPISODE_STEPS:
                 bar.set_postfix_str(f"mean return so far about "
@@ -2039,7 +2091,7 @@ def worker_count(workers, episodes):
 
 
 def _decisions(model, task, config, seeds, workers):
-    """Yields (episode, its next (reward, seconds) pairs) until all episodes are over."""
+    """Yields (episode, its next decisions, as `run_episode` gives them) until all are over."""
     if workers < 1:
         environment, planner = Environment(task), Planner(model, config)
         for i, seed in enumerate(seeds):
@@ -2105,11 +2157,30 @@ def check_finite(values, update, lr):
                             f"diverged; lower the learning rate ({lr})")
 
 
-def train_student(distiller, out, settings):
+def own_episodes(distiller, task, playing, workers):
+    """The next episodes that the student plays, as `Distiller.add` takes them [D9]."""
+    count = distiller.episodes_due
+    sizes = distiller.student.config
+    observation = np.zeros((count, EPISODE_STEPS, sizes.dim_obs), np.float16)
+    action, played = np.zeros((count, EPISODE_STEPS, sizes.dim_action), np.float16), [0] * count
+    first = len(distiller.own_starts) // distiller._own_length
+    seeds = training_seeds(distiller.seed, "own episode", first, count)
+    with progress("the student plays", count * EPISODE_STEPS, "decision") as bar:
+        for i, part in _decisions(distiller.student, task, playing, seeds,
+                                  worker_count(workers, count)):
+            for decision in part:
+                observation[i, played[i]], action[i, played[i]] = decision[:2]
+                played[i] += 1
+            bar.update(len(part))
+    return observation, action
+
+
+def train_student(distiller, out, settings, playing, workers):
     """Algorithm 1 to its end, with a learning curve and checkpoints in `out`.
 
     A run that was cut off goes on from its checkpoint and ends as if it had not been. Returns
-    (curve rows, seconds).
+    (curve rows, seconds). playing, workers: the planner and the processes of the student's own
+    episodes [D9].
     """
     checkpoint, config = out / "checkpoint.npz", distiller.config
     curve, before = [], 0.0
@@ -2123,6 +2194,8 @@ def train_student(distiller, out, settings):
     losses = []
     with progress("distilling", config.steps, "step", distiller.t) as bar:
         while distiller.t < config.steps:
+            if distiller.episodes_due:  # [D9]
+                distiller.add(*own_episodes(distiller, settings["task"], playing, workers))
             rate = learning_rate(config, distiller.t)
             losses.append(distiller.step())
             check_finite({"loss is": losses[-1]}, distiller.t, config.lr)
@@ -2209,18 +2282,36 @@ def draw_curve(path, curve, title):
     return True
 
 
-def evaluation_record(found):
-    """What a model's header keeps of an `evaluate`; `recorded_returns` reads it."""
-    return {k: found[k] for k in ("returns", "seeds", "seed", "planner")}
+def read_records(path):
+    """The evaluations that were recorded for a model: those in the .json file beside it."""
+    path = Path(path).with_suffix(".json")
+    try:
+        records = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
+        if not all({"planner", "seed", "seeds", "returns", "weights"} <= set(r) for r in records):
+            raise ValueError("an entry lacks a key")
+    except (OSError, ValueError, TypeError) as error:
+        raise UserError(f"{path}: not a file that evaluate --record wrote ({error}); delete it and "
+                        f"record anew") from None
+    return records
 
 
-def recorded_returns(header, config, seeds):
-    """The expert's recorded returns for these episodes and this planner, or None."""
-    record = header.get("evaluation") or {}
-    if record.get("planner") != dataclasses.asdict(config) or \
-            record.get("seeds", [])[:len(seeds)] != seeds:
-        return None
-    return record["returns"][:len(seeds)]
+def record_returns(path, model, found):
+    """Keep what `evaluate` found beside the model's file, one entry for planner and seed."""
+    record = {k: found[k] for k in ("planner", "seed", "seeds", "returns")}
+    others = [r for r in read_records(path)
+              if (r["planner"], r["seed"]) != (record["planner"], record["seed"])]
+    with atomic_file(Path(path).with_suffix(".json"), "w") as file:
+        json.dump([*others, {**record, "weights": checksum(model.params.values())}], file, indent=1)
+
+
+def recorded_returns(path, model, config, seeds):
+    """The recorded returns of a model with these weights, planner and episodes, or None."""
+    for record in read_records(path):
+        if (record["planner"] == dataclasses.asdict(config)
+                and record["seeds"][:len(seeds)] == seeds
+                and record["weights"] == checksum(model.params.values())):
+            return record["returns"][:len(seeds)]
+    return None
 
 
 def output_folder(path):
@@ -2252,7 +2343,7 @@ def command_distill(args):
         shares(agents, beside)  # refuses too many
         result = distil(distiller, args, planning, header, out)
     obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
-    result.update(evaluate_both(expert, distiller.student, header, args, planning))
+    result.update(evaluate_both(expert, where, distiller.student, args, planning, config.q_alone))
     result.update(time_both(expert, distiller.student, planning, obs, beside,
                             keep=args.plan_workers is not None))
     result["seconds_total"] = round(time.time() - began, 1)
@@ -2282,8 +2373,10 @@ def load_data(args):
 def distil(distiller, args, planning, header, out):
     """Algorithm 1 to its end; writes student, curve and configuration. Returns result's part."""
     student, config, replay = distiller.student, distiller.config, distiller.replay
+    playing = dataclasses.replace(planning, samples=64, iterations=3, q_alone=config.q_alone)
     settings = {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
                 "distill": dataclasses.asdict(config),
+                "own_planner": dataclasses.asdict(playing) if config.own_episodes else None,
                 "data": [checksum(distiller.expert.params.values()),
                          checksum([replay.observation, replay.action, replay.ends]),
                          replay.header.get("task")]}
@@ -2291,7 +2384,7 @@ def distil(distiller, args, planning, header, out):
           f"features, {len(distiller.optimizer.vector):,} weights; replay of "
           f"{replay.transitions:,} transitions; {config.steps:,} steps of {config.batch_size} x "
           f"{config.noise_samples}; results in {out}", file=sys.stderr)
-    curve, seconds = train_student(distiller, out, settings)
+    curve, seconds = train_student(distiller, out, settings, playing, args.workers)
     rank, returns = rank_correlation(distiller, 256, args.seed, planning.discount)
     save_model(out / "student.npz", student, {"kind": "student", **settings,
                                               "training": header.get("training", {})})
@@ -2305,14 +2398,16 @@ def distil(distiller, args, planning, header, out):
             "picture": draw_curve(out / "curve.png", curve, f"{args.task}, seed {args.seed}")}
 
 
-def evaluate_both(expert, student, header, args, planning):
+def evaluate_both(expert, path, student, args, planning, q_alone):
     """The student's returns and the expert's, recorded or measured: result's part."""
-    where = args.task, planning, args.episodes, args.eval_seed, args.workers
-    theirs = evaluate(student, *where, "evaluating the student")["returns"]
-    returns = recorded_returns(header, planning, episode_seeds(args.eval_seed, args.episodes))
+    where = args.episodes, args.eval_seed, args.workers
+    theirs = evaluate(student, args.task, dataclasses.replace(planning, q_alone=q_alone), *where,
+                      "evaluating the student")["returns"]
+    returns = recorded_returns(path, expert, planning, episode_seeds(args.eval_seed,
+                                                                     args.episodes))
     recorded = returns is not None and not args.evaluate_expert
     if not recorded:
-        returns = evaluate(expert, *where, "evaluating the expert")["returns"]
+        returns = evaluate(expert, args.task, planning, *where, "evaluating the expert")["returns"]
     return {"episodes": args.episodes, "expert_recorded": recorded,
             "expert_return_mean": float(np.mean(returns)),
             "expert_return_std": float(np.std(returns)),
@@ -2435,7 +2530,8 @@ def _acting_worker(connection):
                 episode.play(planner, decisions)
             played += decisions
             for name, seed in tests[len(returns):len(tests) * played // EPISODE_STEPS]:
-                returns.append(sum(r for r, _ in run_episode(testing, planners[name], seed)))
+                returns.append(sum(r for *_, r, _ in run_episode(testing, planners[name],
+                                                             seed)))
             connection.send(None)
         else:
             connection.send(([(np.stack(e.observation), np.stack(e.action),
@@ -2503,7 +2599,7 @@ class OnlineStudent:
 # for a few cores; hidden layers of 512, as in Table 2, make an update three times as dear
 TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
 FOLLOWING_DEFAULTS = {"noise_samples": 3, "horizon": 2}
-TRAINING_BUDGET = {"samples": 128, "iterations": 4}
+TRAINING_BUDGET = {}
 TRAINING_CURVE = ("decisions", "updates", "seconds", "std", "horizon", "return_mean", "return_min",
                   "return_max", "consistency", "reward", "value", "kl_reward", "kl_value",
                   "eval_expert", "eval_student")
@@ -2744,7 +2840,7 @@ def command_train(args):
                              args.episodes, 0, None,
                              f"evaluating the {kind}")
             returns = found["returns"]
-            header["evaluation"] = evaluation_record(found)
+            record_returns(out / f"{kind}.npz", model, found)
             result.update({prefix + "return_mean": float(np.mean(returns)), prefix + "returns":
                            returns, prefix + "return_std": float(np.std(returns))})
             rows.append((kind, f"{np.mean(returns):.0f} ± {np.std(returns):.0f}",
@@ -2790,7 +2886,8 @@ def command_evaluate(args):
     model, header = load_model(args.model)
     made_for = {"discount": trained_discount(header, args.model)}
     if "distill" in header:
-        made_for["horizon"] = from_dict(DistillConfig, header["distill"], args.model).horizon
+        config = from_dict(DistillConfig, header["distill"], args.model)
+        made_for.update(horizon=config.horizon, q_alone=config.q_alone)
     planning = from_args(PlannerConfig, args, **made_for)
     task = args.task or header.get("task")
     if args.record and task != header.get("task"):
@@ -2802,8 +2899,7 @@ def command_evaluate(args):
               "returns": returns, "plan_ms_median": found["plan_ms_median"],
               "episodes": args.episodes, "task": task, "seed": args.seed}
     if args.record:
-        header["evaluation"] = evaluation_record(found)
-        save_model(args.model, model, header)
+        record_returns(args.model, model, found)
     print_table([("task", "episodes", "return", "min", "max", "ms a decision"),
                  (task, str(args.episodes), f"{np.mean(returns):.0f} ± {np.std(returns):.0f}",
                   f"{min(returns):.0f}", f"{max(returns):.0f}", f"{found['plan_ms_median']:.1f}")])
@@ -2896,7 +2992,7 @@ def make_parser():
     sub.add_argument("--evaluate-expert", action="store_true",
                      help="measure the expert's return anew instead of reading its record")
     add_config(sub, DistillConfig)
-    add_config(sub, PlannerConfig, prefix="plan-", skip=("horizon",))
+    add_config(sub, PlannerConfig, prefix="plan-", skip=("horizon", "q_alone"))
 
     sub = add_command(commands, "train", command_train, "Train an expert in NumPy (Equation 1); "
                       "with --student fac, distil it on the way (appendix C.1).",
@@ -2927,7 +3023,8 @@ def make_parser():
     add_config(sub, PlannerConfig, "MPPI while training", "plan-", skip=("discount", "horizon"),
                **TRAINING_BUDGET)
     add_config(sub, DistillConfig, "The student (Algorithm 1), on the expert's batches and steps",
-               "distill-", skip=("steps", "batch_size", "new_targets", "reuse", "held_out"),
+               "distill-", skip=("steps", "batch_size", "new_targets", "reuse", "own_episodes",
+                                "own_share", "held_out"),
                **FOLLOWING_DEFAULTS)
 
     sub = add_command(commands, "evaluate", command_evaluate, "Plan with a model (expert or "
@@ -2939,7 +3036,7 @@ def make_parser():
     sub.add_argument("--workers", type=natural, help="processes that run episodes side by side; 0: "
                      "all in this one [cores]")
     sub.add_argument("--record", action="store_true",
-                     help="write the returns into the model's header, where distill finds them")
+                     help="keep the returns in a .json file beside the model's, for distill")
     add_config(sub, PlannerConfig)
     return parser
 

@@ -181,7 +181,7 @@ def speedups(prediction, decision, planning):
 
 def command_table3(args):
     """table3: the networks and whole decisions on this machine."""
-    planning = fac.from_args(fac.PlannerConfig, args)
+    planning = fac.from_args(fac.PlannerConfig, args, **fac.paper_preset(fac.PlannerConfig))
     args.robots = list(dict.fromkeys(args.robots))
     for robot in args.robots:
         if robot not in ROBOTS:
@@ -275,7 +275,7 @@ def make_parser():
     sub.add_argument("--runs", type=int, default=100, help="of each network; decisions are timed a "
                      "tenth as often [100]")
     sub.add_argument("--figure", help="draw Figure 6 into this file")
-    fac.add_config(sub, fac.PlannerConfig)
+    fac.add_config(sub, fac.PlannerConfig, **fac.paper_preset(fac.PlannerConfig))
     return parser
 
 

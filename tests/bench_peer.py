@@ -113,7 +113,7 @@ def ratios(ours, theirs, turns):
 
 def planning(n, dim_action, turns, compiled=False):
     """(ratio, our ms, PyTorch's ms) of one decision, one thread each."""
-    model, config = make_model(n, dim_action), fac.PlannerConfig()
+    model, config = make_model(n, dim_action), fac.PlannerConfig(samples=512, iterations=6)
     obs = np.random.default_rng(1).standard_normal(24).astype(np.float32)
     theirs = TorchPlanner(model, config)
     z, actions = torch.randn(n, 7, model.config.latent_dim), torch.rand(n, 4, 7, dim_action // n)

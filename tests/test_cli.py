@@ -18,12 +18,13 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 import fac_tdmpc_ref as fac  # noqa: E402
+from test_planning import random_model  # noqa: E402
 
 SCRIPT = ROOT / "fac_tdmpc_ref.py"
 STEPS = 6
 BUDGET = ["--samples", "16", "--iterations", "1"]
 TINY = ["--steps", str(STEPS), "--batch-size", "4", "--horizon", "1", "--held-out", "0.34",
-        "--warmup", "2", "--episodes", "1", "--plan-samples", "16",
+        "--warmup", "2", "--own-episodes", "0", "--episodes", "1", "--plan-samples", "16",
         "--plan-iterations", "1"]
 # BLAS threads that wait for a busy core make runs many times longer
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
@@ -141,10 +142,10 @@ except SystemExit as end:
 @pytest.mark.parametrize("command, expected", [
     ((), ["distill", "evaluate"]),
     (("distill",), ["--task", "--preset", "--num-agents", "--evaluate-expert", "--plan-samples",
-                    "[20000; paper: 100000]", "[forward; paper: reverse]", "reacher-hard"]),
-    (("train",), ["--student", "--plan-samples", "(Table 2) [128; paper: 512]",
+                    "[12000; paper: 100000]", "[forward; paper: reverse]", "reacher-hard"]),
+    (("train",), ["--student", "--plan-samples", "[128; paper: 512]",
                   "(Table 2) [256; paper: 512]"]),
-    (("evaluate",), ["--model", "--record", "--samples", "--output", "[6]"])])
+    (("evaluate",), ["--model", "--record", "--samples", "--output", "[4; paper: 6]"])])
 def test_help_is_quick_and_starts_nothing(tmp_path, command, expected):
     done = succeeded(launch(["-c", WATCHED, *command, "--help"], tmp_path))
     text = re.sub(r"\s+", " ", done.stdout)
@@ -161,7 +162,7 @@ def test_every_setting_has_a_flag_in_help():
                                           ("evaluate", fac.PlannerConfig, "")):
         text = subparsers[command].format_help()
         for f in dataclasses.fields(config_class):
-            name = f.name if f.name == "horizon" else prefix + f.name
+            name = f.name if f.name in ("horizon", "q_alone") else prefix + f.name
             assert f"--{name}".replace("_", "-") in text
 
 
@@ -200,7 +201,7 @@ def test_preset_paper_is_the_paper(monkeypatch):
                 "kl": "reverse", "encoder_input": "observation", "lr": 1e-4,
                 "lr_schedule": "constant", "warmup": 0, "grad_clip": 10, "sizes": "table2",
                 "noise_std": 0.5, "noise_std_min": 0.5, "clip_actions": False, "new_targets": 0,
-                "reuse": 1}
+                "reuse": 1, "own_episodes": 0, "own_share": 0, "q_alone": 0}
     assert {k: found[k] for k in expected} == expected
     assert (planner.samples, planner.iterations, planner.num_elites, planner.pi_trajs,
             planner.horizon, planner.discount) == (512, 6, 64, 24, 3, 0.99)
@@ -229,8 +230,8 @@ def another_value(f):
     (fac.PlannerConfig, "", ["evaluate", "--model", "x"])])
 def test_every_flag_reaches_its_setting(monkeypatch, config_class, prefix, start):
     for f in dataclasses.fields(config_class):
-        if prefix and f.name == "horizon":
-            continue  # distill has one H
+        if prefix and f.name in ("horizon", "q_alone"):
+            continue  # distill has one for loss and planning
         (flag, *rest), value = another_value(f)
         flag = f"--no-{prefix}{flag[3:]}" if flag.startswith("no-") else f"--{prefix}{flag}"
         found = next(c for c in configs_of(monkeypatch, *start, flag, *rest)
@@ -512,6 +513,24 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(killed, distilled):
     assert not (out / "checkpoint.npz").exists() and (out / "result.json").exists()
 
 
+def test_a_killed_run_whose_student_plays_goes_on(tmp_path, files, no_plots):
+    """The student's own episodes depend on its weights alone, whoever plays them [D9]."""
+    def distill(out, *more, stop=-1):
+        arguments = distill_arguments(files, "--own-episodes", "2", "--out", tmp_path / out, *more)
+        return launch(["-c", DRIVER, stop, *arguments], tmp_path, no_plots)
+
+    succeeded(distill("whole", "--workers", "1"))
+    for stop in (3, 5):  # the student plays before steps 2, 3 and 5, counted from 0
+        assert distill("parts", "--workers", "2", stop=stop).returncode == -signal.SIGKILL
+    with np.load(tmp_path / "parts" / "checkpoint.npz") as file:
+        assert file["own_action"].shape == (4, fac.EPISODE_STEPS, 3)
+    succeeded(distill("parts"))
+    assert student_of(tmp_path / "parts") == student_of(tmp_path / "whole")
+    without = distill_arguments(files, "--out", tmp_path / "without")
+    succeeded(launch(["-c", DRIVER, -1, *without], tmp_path, no_plots))
+    assert student_of(tmp_path / "without")[0] != student_of(tmp_path / "whole")[0]
+
+
 @pytest.mark.parametrize("flags, parts", [
     (["--seed", "1"], ["seed: expected 1, found 0"]),
     (["--num-agents", "1"], ["num_agents: expected 1, found 3"]),
@@ -592,11 +611,9 @@ def test_recorded_returns_stand_for_the_expert_in_distill(tmp_path, files, no_pl
     done = run("evaluate", "--model", expert, "--task", "reacher-hard", "--episodes", "2",
                "--workers", "1", "--record", "--json", "--horizon", "1", *BUDGET, cwd=tmp_path)
     measured = last_json(done)
-    model, header = fac.load_model(expert)
-    assert header["evaluation"]["returns"] == measured["returns"]
-    assert header["evaluation"]["seeds"] == fac.episode_seeds(0, 2)
-    before, _ = fac.load_model(files / "expert.npz")
-    assert all(np.array_equal(v, before.params[k]) for k, v in model.params.items())
+    (record,) = fac.read_records(expert)
+    assert record["returns"] == measured["returns"]
+    assert record["seeds"] == fac.episode_seeds(0, 2) and record["planner"]["samples"] == 16
 
     arguments = distill_arguments(files, "--expert", expert, "--num-agents", "1", "--out", "out")
     done = succeeded(run(*arguments, "--workers", "0", cwd=tmp_path, env=no_plots))
@@ -641,13 +658,27 @@ def test_a_student_plans_over_the_horizon_it_was_distilled_over(tmp_path, files,
 @pytest.mark.parametrize("config, seeds, expected", [
     ({}, [5, 6, 7], [1.0, 2.0, 3.0]), ({}, [5, 6], [1.0, 2.0]),
     ({}, [5, 6, 7, 8], None), ({}, [6, 5], None), ({"samples": 511}, [5], None),
+    ({"samples": 7}, [5], [4.0]),
     ({"output": "mean"}, [5], None)])
-def test_a_record_counts_for_its_own_episodes_and_planner_only(config, seeds, expected):
-    header = {"evaluation": {"returns": [1.0, 2.0, 3.0], "seeds": [5, 6, 7],
-                             "planner": dataclasses.asdict(fac.PlannerConfig())}}
-    header = json.loads(json.dumps(header))
-    assert fac.recorded_returns(header, fac.PlannerConfig(**config), seeds) == expected
-    assert fac.recorded_returns({}, fac.PlannerConfig(), seeds) is None
+def test_a_record_counts_for_its_own_episodes_and_planner_only(tmp_path, config, seeds, expected):
+    path, model = tmp_path / "expert.npz", random_model()
+    assert fac.recorded_returns(path, model, fac.PlannerConfig(), seeds) is None
+    for planner, returns in (({}, [1.0, 2.0, 9.0]), ({"samples": 7}, [4.0, 5.0, 6.0]),
+                             ({}, [1.0, 2.0, 3.0])):  # the last replaces the first
+        fac.record_returns(path, model, {
+            "returns": returns, "seeds": [5, 6, 7], "seed": 0, "plan_ms_median": 1.0,
+            "planner": dataclasses.asdict(fac.PlannerConfig(**planner))})
+    assert len(fac.read_records(path)) == 2
+    assert fac.recorded_returns(path, model, fac.PlannerConfig(**config), seeds) == expected
+    other = random_model(seed=1)
+    assert fac.recorded_returns(path, other, fac.PlannerConfig(**config), seeds) is None
+
+
+@pytest.mark.parametrize("text", ["{", "[{}]", "[3]", '"x"'])
+def test_a_spoilt_record_is_named(tmp_path, text):
+    (tmp_path / "expert.json").write_text(text)
+    with pytest.raises(fac.UserError, match="expert.json: not a file that evaluate --record wrote"):
+        fac.read_records(tmp_path / "expert.npz")
 
 
 # the project --------------------------------------------------------------------------
@@ -682,8 +713,8 @@ def test_the_readme_distils_an_expert_of_one_s_own(tmp_path, monkeypatch):
     exec(bring, {"obs": rng.standard_normal((180, 24)).astype(np.float16),
                  "action": rng.uniform(-1, 1, (180, 6)).astype(np.float16),
                  "more": np.arange(180) % 9 < 8})
-    assert "DistillConfig()" in distil
-    exec(distil.replace("DistillConfig()", "DistillConfig(steps=2)"), {"fac": fac})
+    assert "own_episodes=0" in distil
+    exec(distil.replace("own_episodes=0", "own_episodes=0, steps=2"), {"fac": fac})
     student, _ = fac.load_model("mine/student.npz")
     assert (student.config.num_agents, student.config.dim_action) == (6, 6)
 

@@ -7,7 +7,7 @@ import pytest
 import fac_tdmpc_ref as fac
 from test_planning import random_model
 
-CONFIG = fac.DistillConfig(steps=300, batch_size=16, warmup=20, lr=3e-3, horizon=3)
+CONFIG = fac.DistillConfig(steps=300, batch_size=16, warmup=20, lr=3e-3, horizon=3, own_episodes=0)
 
 
 def write_replay(path, task="", mark=None):
@@ -87,17 +87,48 @@ def go_on(distiller, steps):
     distiller.close()
 
 
-@pytest.mark.parametrize("pool", [4096, 64])
-def test_a_resumed_run_ends_as_an_uninterrupted_one(replay, monkeypatch, pool):
+def own_episodes(*values):
+    """Episodes of one observation and one action each, as `Distiller.add` takes them."""
+    observation = np.zeros((len(values), fac.EPISODE_STEPS, 8)) + np.array(values)[:, None, None]
+    return observation, np.full((len(values), fac.EPISODE_STEPS, 3), 0.25)
+
+
+@pytest.mark.parametrize("pool, own", [(4096, False), (64, False), (64, True)])
+def test_a_resumed_run_ends_as_an_uninterrupted_one(replay, monkeypatch, pool, own):
     monkeypatch.setattr(fac, "POOL", pool)  # a pool of 64 lasts 16 steps
-    whole, _ = distilled(replay, CONFIG, 12)
+    whole, _ = distilled(replay, CONFIG, 5)
+    if own:
+        whole.add(*own_episodes(0.5, -0.5))
+    go_on(whole, 7)
     second, _ = distilled(replay, CONFIG, 3)  # somewhere else, then put back
     second.load({k: np.copy(v) for k, v in whole.state().items()})
     go_on(whole, 8)
     go_on(second, 8)
     assert np.array_equal(whole.optimizer.vector, second.optimizer.vector)
     without, _ = distilled(replay, CONFIG, 20)
-    assert np.array_equal(whole.optimizer.vector, without.optimizer.vector)
+    assert np.array_equal(whole.optimizer.vector, without.optimizer.vector) != own
+
+
+def test_a_share_of_the_states_is_the_students_own(replay):
+    config = fac.dataclasses.replace(CONFIG, encoder_input="observation", own_share=0.25,
+                                     noise_std=1e-3, noise_std_min=1e-3, batch_size=400)
+    rows = len(replay.observation)
+    with fresh(replay, config) as distiller:
+        distiller.add(*own_episodes(7, 8))
+        distiller.add(*own_episodes(9))
+        (features,), actions, _ = distiller.batch(0)
+        assert len(distiller.own_starts) == 3 * 497 and len(replay.observation) == rows
+        own = features.min(0) >= 7
+        assert 0.18 < own.mean() < 0.32 and set(features[0, own]) == {7, 8, 9}
+        assert np.abs(actions[:, :, own] - 0.25).max() < 0.01
+        for starts in (distiller.train_starts, distiller.held_out_starts):
+            assert starts.max() < rows
+    for quarters, expected in ((0, 0), (1, 2), (2, 4), (3, 6)):
+        with fresh(replay, fac.dataclasses.replace(config, own_episodes=2)) as distiller:
+            distiller.optimizer.adam.t = quarters * 75
+            assert distiller.episodes_due == expected
+            distiller.add(*own_episodes(*range(expected)))
+            assert distiller.episodes_due == 0
 
 
 def test_each_state_of_a_pool_is_learned_from_as_often_as_it_says(replay, monkeypatch):

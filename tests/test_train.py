@@ -134,7 +134,7 @@ def test_train_prints_json_and_writes_what_distill_takes(trained, tmp_path):
     assert [bool(r["eval_expert"] and r["eval_student"]) for r in rows] == [False, True, True]
     assert fac.Replay(folder / "replay.npz").transitions == 3000
     distilled = run("distill", "--task", "reacher-easy", "--expert", folder, "--steps", "3",
-                    "--episodes", "1", "--plan-samples", "8",
+                    "--own-episodes", "0", "--episodes", "1", "--plan-samples", "8",
                     "--plan-iterations", "1", "--held-out", "0.5", "--json", cwd=tmp_path)
     assert last_json(distilled)["steps"] == 3
 
