@@ -121,8 +121,8 @@ def expert_golden(model, target, g, config):
                                 double(g["rewards"]), config)
     found["equation1_terms"] = np.array([t.item() for t in terms])
     found["equation1_loss"] = np.array(loss.item())
-    found.update({f"equation1_grad {k}": v for k, v in gradients(loss, params).items()
-                  if not k.startswith("_pi")})
+    found.update(plain_shapes({k: v for k, v in gradients(loss, params).items()
+                               if not k.startswith("_pi")}, "equation1_grad "))
     return found
 
 

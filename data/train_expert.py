@@ -542,7 +542,7 @@ def make_parser():
     add("--json", action="store_true", help="print one JSON object as the last line of stdout")
     fac.add_config(parser, fac.ExpertConfig, **TRAINING_DEFAULTS)
     fac.add_config(parser, fac.PlannerConfig, "MPPI while training", "plan-",
-                   skip=("discount", "horizon"), **PLANNING_BUDGET)
+                   skip=("discount",), **PLANNING_BUDGET)
     fac.add_config(parser, fac.DistillConfig, "The student (Algorithm 1), on the expert's batches "
                    "and steps", "distill-", skip=("steps", "batch_size", "new_targets",
                                                   "own_episodes", "own_share", "held_out"),
