@@ -42,9 +42,9 @@ def rollout(params, z, actions):
     steps, _, batch, noise = actions.shape
     z, outputs = z.repeat_interleave(noise, 1), []
     for h in range(steps):
-        a = actions[h].reshape(len(z), -1, batch * noise).mT
-        outputs.append([x.view(batch, noise) for x in heads(params, z, a)])
-        z = transition(params, z, a)
+        x = torch.cat([z, actions[h].reshape(len(z), -1, batch * noise).mT], -1)
+        outputs.append([output.view(batch, noise) for output in heads(params, x)])
+        z = transition(params, x)
     return [torch.stack(head) for head in zip(*outputs)]
 
 
@@ -113,10 +113,10 @@ def expert_golden(model, target, g, config):
     params = trainable(model)
     obs, action = double(g["obs"]).mT, double(g["action"]).mT
     z = network(fac.ENCODER, params, "_encoder", obs[:1])
-    reward, q1, q2 = heads(params, z, action[:1])
-    found = {"latent": last(z)[0], "next_latent": last(transition(params, z, action[:1]))[0],
-             "reward": reward.detach().numpy(), "q1": q1.detach().numpy(),
-             "q2": q2.detach().numpy(), "policy": last(policy(params, z))[0]}
+    x = torch.cat([z, action[:1]], -1)
+    found = {"latent": last(z)[0], "next_latent": last(transition(params, x))[0],
+             "policy": last(policy(params, z))[0]}
+    found.update(zip(("reward", "q1", "q2"), (y.detach().numpy() for y in heads(params, x))))
     loss, terms, _ = equation_1(params, {k: double(v) for k, v in target.items()}, obs, action,
                                 double(g["rewards"]), config)
     found["equation1_terms"] = np.array([t.item() for t in terms])
@@ -135,9 +135,9 @@ def mppi_golden(model, g, planner):
     z, value = network(fac.ENCODER, params, "_encoder", double(g["obs"])[:1, :, :1].mT), 0.0
     z = z.expand(-1, planner.samples, -1)
     for h in range(planner.horizon):
-        value = value + planner.discount ** h * heads(params, z, actions[h:h + 1])[0]
-        z = transition(params, z, actions[h:h + 1])
-    _, q1, q2 = heads(params, z, actions[-1:])
+        x = torch.cat([z, actions[h:h + 1]], -1)
+        value, z = value + planner.discount ** h * heads(params, x)[0], transition(params, x)
+    _, q1, q2 = heads(params, torch.cat([z, actions[-1:]], -1))
     value = value + planner.discount ** planner.horizon * (q1 + q2) / 2
     top, index = value.topk(planner.num_elites)
     score = torch.softmax(planner.temperature * top, 0)[None, :, None]

@@ -29,28 +29,39 @@ def network(kinds, params, name, x):
             with torch.autocast(x.device.type, enabled=False):
                 x = linear(x.to(W.dtype), W, b)
         elif kind == "norm":
-            x = F.layer_norm(x, x.shape[-1:]) * W.mT + b.mT
+            x = norm(x, W, b)
         else:
             x = F.elu(x) if kind == "elu" else torch.tanh(x)
     return x
 
 
 def linear(x, W, b):
-    """x W^T + b for each agent; one agent's is quicker as it is meant for."""
+    """x W^T + b for each agent; a single one's as PyTorch is fastest."""
     if len(W) == 1:
         return F.linear(x[0], W[0], b[0, :, 0])[None]
     return torch.baddbmm(b.mT, x, W.mT)
 
 
-def heads(params, z, a):
-    """Global reward and both Q, the sums over agents: three (B,) of z (N, B, m), a (N, B, d)."""
-    x = torch.cat([z, a], -1)
-    return [network(kinds, params, name, x).sum(0)[:, 0] for name, kinds in fac.HEADS]
+def norm(x, W, b):
+    """LayerNorm with each agent's own scale and shift."""
+    if len(W) == 1:
+        return F.layer_norm(x, x.shape[-1:], W[0, :, 0], b[0, :, 0])
+    return F.layer_norm(x, x.shape[-1:]) * W.mT + b.mT
 
 
-def transition(params, z, a):
-    """f_T: the next latents (N, B, m)."""
-    return network(fac.MLP, params, "_dynamics", torch.cat([z, a], -1))
+def heads(params, x, networks=fac.HEADS):
+    """Global reward and both Q, or those named: sums over agents, (B,) each, of x (N, B, m + d)."""
+    return [network(kinds, params, name, x).sum(0)[:, 0] for name, kinds in networks]
+
+
+def transition(params, x):
+    """f_T: the next latents (N, B, m) of x (N, B, m + d)."""
+    return network(fac.MLP, params, "_dynamics", x)
+
+
+def least_q(params, z, a):
+    """min(Q1, Q2) (B,) of latents (N, B, m) and actions (N, B, d)."""
+    return torch.minimum(*heads(params, torch.cat([z, a], -1), fac.HEADS[1:]))
 
 
 def policy(params, z, noise=0.0):
@@ -70,13 +81,13 @@ def equation_1(params, target, obs, action, reward, config, noise=0.0):
     after = obs[1:].reshape(1, steps * batch, -1)
     with torch.no_grad():
         s_next, z_next = (network(fac.ENCODER, p, "_encoder", after) for p in (target, params))
-        _, q1, q2 = heads(target, z_next, policy(params, z_next, noise))
-        td = reward + config.discount * torch.minimum(q1, q2).view(steps, batch)
+        q = least_q(target, z_next, policy(params, z_next, noise))
+        td = reward + config.discount * q.view(steps, batch)
     latents, terms = [network(fac.ENCODER, params, "_encoder", obs[:1])], [0.0, 0.0, 0.0]
     for h in range(steps):
-        z, a = latents[-1], action[h:h + 1]
-        r, q1, q2 = heads(params, z, a)
-        latents.append(transition(params, z, a))
+        x = torch.cat([latents[-1], action[h:h + 1]], -1)
+        r, q1, q2 = heads(params, x)
+        latents.append(transition(params, x))
         found = (F.mse_loss(latents[-1], s_next[:, h * batch:(h + 1) * batch]),
                  F.mse_loss(r, reward[h]), F.mse_loss(q1, td[h]) + F.mse_loss(q2, td[h]))
         terms = [term + config.lam ** h * x for term, x in zip(terms, found)]
@@ -131,7 +142,7 @@ class TorchLearner:
         latents = latents.detach()
         with self._autocast():
             a = policy(self.params, latents, noise[:, steps * batch:])
-            q = torch.minimum(*heads(self.params, latents, a)[1:]).view(-1, batch).mean(1)
+            q = least_q(self.params, latents, a).view(-1, batch).mean(1)
         self._step(self._policy_optimizer, -sum(config.lam ** h * x for h, x in enumerate(q)))
         self.updates += 1
         if self.updates % config.target_every == 0:

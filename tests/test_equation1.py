@@ -145,13 +145,13 @@ def test_half_precision_ends_at_the_last_layer():
     from torch_learner import TorchLearner, heads, torch
     learner = TorchLearner(small_learner(np.random.default_rng(0), np.float32).model, CONFIG,
                            "cpu", "bfloat16")
-    z, a = torch.randn(1, 50, CONFIG.latent_dim), torch.randn(1, 50, 2)
+    x = torch.randn(1, 50, CONFIG.latent_dim + 2)
     torch.nn.init.normal_(learner.params["_Q1.5.weight"])
     with torch.no_grad():
         with learner._autocast():
-            half = heads(learner.params, z, a)[1] + 100
+            half = heads(learner.params, x)[1] + 100
             half -= 100
-        whole = heads(learner.params, z, a)[1]
+        whole = heads(learner.params, x)[1]
     assert half.dtype == torch.float32
     assert 0 < (half - whole).abs().max() < 0.03 * whole.std()  # bfloat16's steps at 100 are 0.5
 
