@@ -5,8 +5,8 @@ into a student whose latent state, dynamics, reward and value fall apart into on
 each action dimension. Each joint then plans alone: cheaper, and in parallel. What that keeps of
 the return is measured, in the README. This file holds the method whole: networks with
 hand-written gradients, Adam, TD-MPC's Equation 1, Algorithm 1 (Equation 4), MPPI (Equations 2 and
-3), planning workers, environments, and the command line. The experts in data/ were trained by
-the same Equation 1 in PyTorch (data/train_expert.py), which the golden tests compare with.
+3), planning workers, environments, and the command line. data/train_expert.py trains experts with
+Equation 1, as it is here or in PyTorch, which the golden tests compare with.
 
     python fac_tdmpc_ref.py distill --task reacher-hard
     python fac_tdmpc_ref.py evaluate --model runs/reacher-hard-0/student.npz

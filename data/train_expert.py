@@ -57,16 +57,15 @@ class Episode:
         elif planner:
             planner.reset(self.seed)
         for _ in range(decisions):
-            action = self.explore(planner) if planner else self.rng.uniform(
-                -1, 1, self.environment.dim_action).astype(np.float32)
-            obs, reward = self.environment.step(action)
-            for history, item in zip((self.observation, self.action, self.reward),
-                                     (obs, action, reward)):
-                history.append(item)
+            self.action.append(self._explore(planner))
+            obs, reward = self.environment.step(self.action[-1])
+            self.observation.append(obs)
+            self.reward.append(reward)
         self._warm_start = planner and planner.warm_start
 
-    def explore(self, planner):
-        """The planned action (A,) with noise."""
+    def _explore(self, planner):
+        if planner is None:
+            return self.rng.uniform(-1, 1, self.environment.dim_action).astype(np.float32)
         action = planner.act(self.observation[-1])
         deviation = self.exploration_std  # in TD-MPC's code: MPPI's last one, at least this
         noise = deviation * self.rng.standard_normal(action.shape, np.float32)
@@ -169,8 +168,11 @@ def make_learner(args, sizes, config):
         raise fac.UserError("--backend torch needs PyTorch: pip install torch") from None
     from torch_learner import TorchLearner
     torch.set_num_threads(args.threads)
-    return TorchLearner(fac.WorldModel.create(sizes, rng, policy=True), config, args.device,
-                        args.precision)
+    model = fac.WorldModel.create(sizes, rng, policy=True)
+    try:
+        return TorchLearner(model, config, args.device, args.precision)
+    except (AssertionError, RuntimeError) as error:  # no such device, or none here
+        raise fac.UserError(f"--device {args.device}: {str(error).splitlines()[0]}") from None
 
 
 class OnlineStudent:
@@ -257,9 +259,9 @@ class Training:
         """The planner of training episodes, with the weights of now, as `Actors.play` takes it."""
         if self.warming:
             return {}
-        exploration_std, horizon = self.scheduled().values()
+        now = self.scheduled()
         return {"explorer": (self.learner.model, dataclasses.replace(
-            self.planning, min_std=exploration_std, horizon=horizon))}
+            self.planning, min_std=now["exploration_std"], horizon=now["horizon"]))}
 
     def explorations(self):
         """A round's training episodes, as `Actors.begin` takes them."""
@@ -429,7 +431,7 @@ def train(args):
         training.load(checkpoint)
     elif args.resume:
         raise fac.UserError(f"{checkpoint}: no such file; there is nothing to resume")
-    left = config.updates_per_step * (args.steps - training.decisions)
+    left = config.updates_per_step * max(0, args.steps - training.decisions)
     began, done = time.time(), False
     with contextlib.closing(Actors(args.task, min(args.workers, args.envs))) as actors, \
             fac.one_thread(), fac.progress("training", int(training.allowed + left), "update",

@@ -303,6 +303,8 @@ def test_train_expert_in_stretches(tmp_path, capsys):
     for part in ("checkpoint.npz", "lr: expected 0.001, found 0.0005", "--out"):
         assert part in message
     assert train(1500, "--backend", "numpy") == 2
+    assert train(1500, "--device", "nonsense") == 2
+    assert "--device nonsense" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_a_run_in_pytorch_goes_on_to_the_same_result(tmp_path, capsys):
