@@ -5,12 +5,11 @@ into a student whose latent state, dynamics, reward and value fall apart into on
 each action dimension. Each joint then plans alone: cheaper, and in parallel. What that keeps of
 the return is measured, in the README. This file holds the method whole: networks with
 hand-written gradients, Adam, TD-MPC's Equation 1, Algorithm 1 (Equation 4), MPPI (Equations 2 and
-3), planning workers, environments, and the command line. The experts in data/ were trained by
-the same Equation 1 in PyTorch (data/train_expert.py), which the golden tests compare with.
+3), planning workers, environments, and the command line. data/train_expert.py trains experts with
+Equation 1, as it is here or in PyTorch, which the golden tests compare with.
 
     python fac_tdmpc_ref.py distill --task reacher-hard
     python fac_tdmpc_ref.py evaluate --model runs/reacher-hard-0/student.npz
-    python fac_tdmpc_ref.py train --task reacher-easy --student fac
 
 The one idea that keeps it small: every model carries an agent axis N, and a centralized model is
 the case N = 1. There is one world model, one planner, one loss. The axes, everywhere:
@@ -1720,47 +1719,6 @@ def new_targets(obs, rng):
     return radius * np.stack([np.cos(angle), np.sin(angle)]) - finger
 
 
-def _environment_worker(connection):
-    environments = [Environment(task) for task in connection.recv()]
-    while True:
-        command, values = connection.recv()
-        connection.send([getattr(e, command)(v) for e, v in zip(environments, values)])
-
-
-class EnvironmentPool:
-    """`count` environments of a task in `workers` processes (at least one), stepped together.
-
-    Every episode lasts EPISODE_STEPS, so they all start and end at the same time.
-    """
-
-    def __init__(self, task, count, workers):
-        lookup_task(task)
-        self._shares = [s for s in np.array_split(np.arange(count), max(1, workers)) if len(s)]
-        self._workers = Workers(_environment_worker, len(self._shares), "environment worker")
-        for i, share in enumerate(self._shares):
-            self._workers.send(i, [task] * len(share))
-
-    def _call(self, command, values):
-        for i, share in enumerate(self._shares):
-            self._workers.send(i, (command, [values[j] for j in share]))
-        return [answer for answers in self._workers.receive_all() for answer in answers]
-
-    def reset(self, seeds):
-        """One integer seed for each environment; returns observations (count, dim O)."""
-        return np.stack(self._call("reset", seeds))
-
-    def step(self, actions):
-        """actions (count, dim A); returns observations (count, dim O) and rewards (count,)."""
-        obs, reward = zip(*self._call("step", actions))
-        return np.stack(obs), np.array(reward, F32)
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self._workers.close()
-
-
 # ======================================================================================
 # 8. Data: weights, replay, files
 # ======================================================================================
@@ -1966,23 +1924,16 @@ class ReplayBuffer:
         self.observation[:kept], self.action[:kept], self.reward[:kept] = (
             state[k] for k in ("observation", "action", "reward"))
 
-    def sample(self, rng, batch, steps, task):
-        """Segments drawn evenly, float32; three quarters of reacher's with another target [D6].
-
-        Returns observations (H + 1, O, B), actions (H, A, B) and rewards (H, B).
-        """
+    def sample(self, rng, batch, steps):
+        """Segments drawn evenly, float32: observations (H + 1, O, B), actions (H, A, B), rewards
+        (H, B), and where they begin: episodes and steps, (B,) each."""
         episode = rng.integers(len(self), size=batch)
         start = rng.integers(EPISODE_STEPS - steps + 1, size=batch)
         rows = start + np.arange(steps + 1)[:, None]
         obs = self.observation[episode, rows].astype(F32)
         action = self.action[episode, rows[:-1]].astype(F32)
         reward = self.reward[episode, rows[:-1]]
-        if task.startswith("reacher"):
-            later = self.observation[episode, rng.integers(start + 1, EPISODE_STEPS + 1), 3:5]
-            moved, fresh = rng.random((2, batch)) < [[3 / 4], [1 / 3]]
-            back = np.where(fresh, obs[0, :, 3:5].T - new_targets(obs[0].T, rng), later.T).T
-            move_target(obs, reward, back.astype(F32), moved, task)
-        return obs.swapaxes(1, 2), action.swapaxes(1, 2), reward
+        return obs.swapaxes(1, 2), action.swapaxes(1, 2), reward, (episode, start)
 
     def write(self, path, header):
         """A file for `Replay`: oldest episode first; an episode's last row has no action."""
@@ -2356,7 +2307,7 @@ def command_distill(args):
 
 def load_data(args):
     """(expert, its header, replay, the expert's path) that distill's arguments name."""
-    if args.expert and os.path.isdir(args.expert):  # as `train` and data/TASK hold them
+    if args.expert and os.path.isdir(args.expert):  # as train_expert.py and data/TASK hold them
         args.replay = args.replay or Path(args.expert) / "replay.npz"
         args.expert = Path(args.expert) / "expert.npz"
     path = args.expert or data_file(args.task, "expert.npz")
@@ -2478,408 +2429,6 @@ def print_table(rows):
                         for i, (cell, w) in enumerate(zip(row, widths))))
 
 
-class Exploration:
-    """A training episode, played in parts so that each can plan with newer weights.
-
-    `observation` (T + 1, O), `action` (T, A) and `reward` (T,) grow as lists. They depend on the
-    seed and on the models it was played with.
-    """
-
-    def __init__(self, environment, seed, std):
-        self.environment, self.seed, self.std = environment, seed, std
-        self.rng, self.warm_start = stream(seed, "exploration"), None
-        self.observation, self.action, self.reward = [environment.reset(seed)], [], []
-
-    def play(self, planner, decisions):
-        """Go on with a planner, whose actions get noise of deviation `std`, or None: at random."""
-        if planner and self.warm_start:
-            planner.warm_start = self.warm_start
-        elif planner:
-            planner.reset(self.seed)
-        for _ in range(decisions):
-            if planner:
-                action = planner.act(self.observation[-1])
-                noise = self.std * self.rng.standard_normal(action.shape, F32)
-                action = np.clip(action + noise, -1, 1)
-            else:
-                action = self.rng.uniform(-1, 1, self.environment.dim_action).astype(F32)
-            obs, reward = self.environment.step(action)
-            self.observation.append(obs)
-            self.action.append(action)
-            self.reward.append(reward)
-        self.warm_start = planner and planner.warm_start
-
-
-def _acting_worker(connection):
-    """Plays what `Actors` sends: of the tests, in each part, its share of the episodes' length."""
-    task = connection.recv()
-    message = connection.recv()  # before anything can fail: the parent waits until it is read
-    environments, testing = [], Environment(task)
-    while True:
-        command, *values = message
-        if command == "begin":
-            seeds, std, models, tests = values
-            environments += [Environment(task) for _ in seeds[len(environments):]]
-            episodes = [Exploration(e, seed, std) for e, seed in zip(environments, seeds)]
-            planners = {name: Planner(*model) for name, model in models.items()}
-            played, returns = 0, []
-        elif command == "play":
-            decisions, *planning = values
-            planner = Planner(*planning) if planning else None
-            for episode in episodes:
-                episode.play(planner, decisions)
-            played += decisions
-            for name, seed in tests[len(returns):len(tests) * played // EPISODE_STEPS]:
-                returns.append(sum(r for *_, r, _ in run_episode(testing, planners[name],
-                                                             seed)))
-            connection.send(None)
-        else:
-            connection.send(([(np.stack(e.observation), np.stack(e.action),
-                               np.array(e.reward, F32)) for e in episodes], returns))
-        message = connection.recv()
-
-
-class Actors:
-    """Processes that play episodes, part by part, while this one learns."""
-
-    def __init__(self, task, workers):
-        lookup_task(task)
-        self._workers, self._count = Workers(_acting_worker, workers, "acting worker"), workers
-        self._workers.send_all(task)
-
-    def begin(self, seeds, std, models, tests):
-        """Start a training episode for each seed, with exploration noise of deviation std.
-
-        Beside them go whole episodes without noise: tests (name, seed), with the weights that
-        models {name: (model, planner config)} have now.
-        """
-        for i in range(self._count):
-            self._workers.send(i, ("begin", seeds[i::self._count], std, models,
-                                   tests[i::self._count]))
-
-    def play(self, decisions, *planning):
-        """Let the episodes go on by so many decisions: (model, planner config), or at random."""
-        self._workers.send_all(("play", decisions, *planning))
-
-    def wait(self):
-        """Until they have."""
-        self._workers.receive_all()
-
-    def collect(self):
-        """(observations, actions, rewards) of every episode, and the tests' returns."""
-        self._workers.send_all(("collect",))
-        shares = self._workers.receive_all()
-        return [[shares[i % self._count][part][i // self._count]
-                 for i in range(sum(len(share[part]) for share in shares))] for part in (0, 1)]
-
-    def close(self):
-        """End the processes."""
-        self._workers.close()
-
-
-class OnlineStudent:
-    """Appendix C.1: Algorithm 1 on the batches, and with the expert, of a training that goes on."""
-
-    def __init__(self, expert, num_agents, config, seed):
-        self.expert, self.config, self.seed, self._arena = expert, config, seed, Arena()
-        self.optimizer, self.model = new_student(expert, num_agents, config, seed)
-
-    def update(self, obs, actions):
-        """One step of Algorithm 1 on observations (O, B) and actions (H, A, B); its losses."""
-        config, t = self.config, self.optimizer.adam.t
-        self._arena.rewind()
-        batch = perturbed_batch(self.expert, self.model, obs,
-                                actions[:config.horizon + 1], config,
-                                stream(self.seed, "perturbations", t), self._arena.empty)
-        losses = distill_loss(self.model, *batch, config, self.optimizer.grads, self._arena.empty)
-        self.optimizer.step(learning_rate(config, t), config.grad_clip)
-        return losses
-
-
-# for a few cores; hidden layers of 512, as in Table 2, make an update three times as dear
-TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
-FOLLOWING_DEFAULTS = {"noise_samples": 3, "horizon": 2}
-TRAINING_BUDGET = {}
-TRAINING_CURVE = ("decisions", "updates", "seconds", "std", "horizon", "return_mean", "return_min",
-                  "return_max", "consistency", "reward", "value", "kl_reward", "kl_value",
-                  "eval_expert", "eval_student")
-
-
-class Training:
-    """An expert that learns (Equation 1), the student that may follow it, and their replay.
-
-    Rounds: while the actors play `envs` episodes, with new weights every `refresh` decisions, the
-    learner makes the updates that the decisions so far allow. Everything depends on the seed, not
-    on the number of workers, and all of it is in `state`.
-    """
-
-    def __init__(self, args, config, planning, distilling):
-        _, _, dim_obs, dim_action = lookup_task(args.task)
-        self.args, self.config, self.planning = args, config, planning
-        sizes = ModelConfig(dim_obs, dim_action, 1, config.latent_dim, config.enc_dim,
-                            config.mlp_dim)
-        self.learner = Learner(sizes, config, stream(args.seed, "expert"))
-        self.student = distilling and OnlineStudent(self.learner.model, args.num_agents,
-                                                    distilling, args.seed)
-        self.buffer = ReplayBuffer(dim_obs, dim_action, config.buffer_size,
-                                   np.dtype(config.buffer_dtype))
-        self.decisions, self.seconds, self.curve = 0, 0.0, []
-        self.settings = {
-            "task": args.task, "seed": args.seed, "envs": args.envs, "steps": args.steps,
-            "refresh": args.refresh, "evaluate_every": args.evaluate_every,
-            "config": dataclasses.asdict(config), "planner": dataclasses.asdict(planning),
-            "num_agents": args.num_agents,
-            "distill": distilling and dataclasses.asdict(distilling)}
-
-    @property
-    def updates(self):
-        return self.learner.updates
-
-    def learn(self):
-        """One update of the expert and, on the same batch, one of the student."""
-        rng = stream(self.args.seed, "update", self.updates)
-        obs, actions, reward = self.buffer.sample(rng, self.config.batch_size, self.config.horizon,
-                                                  self.args.task)
-        terms, _ = self.learner.update(obs, actions, reward, rng)
-        kl = self.student.update(obs[0], actions)[1:] if self.student else (0.0, 0.0)
-        return *terms, *kl
-
-    def learn_until(self, updates, bar):
-        """Updates until there were so many; returns their losses."""
-        losses = []
-        while self.updates < updates:
-            losses.append(self.learn())
-            check_finite({"losses are": losses[-1]}, self.updates, self.config.lr)
-            bar.update()
-        return losses
-
-    @property
-    def std(self):
-        """Smallest sampling deviation: falls from std_start over the first decisions (TD-MPC)."""
-        return float(np.interp(self.decisions, [0, self.config.std_steps],
-                               [self.config.std_start, self.planning.min_std]))
-
-    def round(self, actors, bar):
-        """Episodes and the updates they allow, side by side; adds a row to the curve.
-
-        Evaluations are of the weights at the round's start: they belong to the row before.
-        """
-        args, config, began = self.args, self.config, time.time()
-        quota = args.envs * EPISODE_STEPS
-        horizon = int(np.interp(self.decisions, [0, config.std_steps], [1, self.planning.horizon]))
-        first, std = self.decisions // EPISODE_STEPS, self.std
-        warming = self.decisions < config.seed_decisions
-        exploring = () if warming else (self.learner.model, dataclasses.replace(
-            self.planning, min_std=std, horizon=horizon))
-        start = self.updates
-        due = start if warming else int(config.updates_per_step * self.decisions)
-        losses = []
-        tested = self.curve and not warming and self.decisions % args.evaluate_every < quota
-        actors.begin(training_seeds(args.seed, "training episode", first, args.envs), std,
-                     *(self.tests() if tested else ({}, [])))
-        for played in range(0, EPISODE_STEPS, args.refresh):
-            end = min(played + args.refresh, EPISODE_STEPS)
-            actors.play(end - played, *exploring)
-            losses += self.learn_until(start + (due - start) * end // EPISODE_STEPS, bar)
-            actors.wait()
-        episodes, returns = actors.collect()
-        for episode in episodes:
-            self.buffer.add(*episode)
-        self.decisions += quota
-        if warming and self.decisions >= config.seed_decisions:  # one round's behind, as later
-            losses = self.learn_until(int(config.updates_per_step * (self.decisions - quota)), bar)
-        self.seconds += time.time() - began
-        self.check()
-        tests, played = self.tested(returns), [float(reward.sum()) for *_, reward in episodes]
-        self.curve.append([self.decisions, self.updates, round(self.seconds, 1), std, horizon,
-                           float(np.mean(played)), min(played), max(played),
-                           *(np.mean(losses, 0).tolist() if losses else [None] * 5), None, None])
-        bar.set_postfix_str(f"{self.decisions:,} decisions, return {np.mean(played):.0f}" + "".join(
-            f", {name} {r:.0f}" for name, r in tests.items()), False)
-
-    def tests(self):
-        """An evaluation's models and tests, as Actors.begin takes them; the training's budget."""
-        models = {"expert": (self.learner.model, self.planning)}
-        if self.student:
-            models["student"] = self.student.model, self.planning
-        return models, [(name, seed) for name in models for seed in episode_seeds(
-            self.args.seed + 1, self.args.evaluate_episodes)]
-
-    def tested(self, returns):
-        """Put an evaluation's returns, if any, into the last row; returns their means by name."""
-        means = np.reshape(returns, (-1, self.args.evaluate_episodes)).mean(1).tolist()
-        if means:
-            self.curve[-1][-2:] = (*means, None)[:2]
-        return dict(zip(("expert", "student"), means))
-
-    def finish(self, updates, actors, bar):
-        """The updates that are left, and an evaluation of what came out."""
-        began = time.time()
-        self.learn_until(updates, bar)
-        self.check()
-        actors.begin([], 0.0, *self.tests())
-        actors.play(EPISODE_STEPS)
-        actors.wait()
-        self.tested(actors.collect()[1])
-        self.seconds += time.time() - began
-
-    def check(self):
-        """UserError if weights are not finite."""
-        for name, part in self.optimizers().items():
-            check_finite({f"weights ({name}) are": part.vector}, self.updates, self.config.lr)
-
-    def optimizers(self):
-        """Everything that is learned, by name."""
-        found = {"expert": self.learner.optimizer, "policy": self.learner.policy_optimizer}
-        return {**found, "student": self.student.optimizer} if self.student else found
-
-    def state(self):
-        """(header, arrays) that a resumed run needs; `load` takes them back."""
-        arrays = {f"{name} {k}": v for name, part in self.optimizers().items()
-                  for k, v in part.state().items()}
-        arrays.update(slow=self.learner.slow_vector, **self.buffer.state())
-        return {"kind": "checkpoint", "settings": self.settings, "decisions": self.decisions,
-                "updates": self.updates, "seconds": self.seconds, "curve": self.curve}, arrays
-
-    def load(self, header, arrays, where):
-        """Go on from a `state`; UserError if it is another run's."""
-        same_settings(header["settings"], self.settings, where)
-        for key in self.state()[1]:
-            if key not in arrays:
-                raise UserError(f"{where}: {key}: missing; delete the file to start anew")
-        for name, part in self.optimizers().items():
-            part.load({k[len(name) + 1:]: v for k, v in arrays.items() if k.startswith(name + " ")})
-        self.learner.slow_vector[:] = arrays["slow"]
-        self.buffer.load(arrays)
-        self.decisions, self.seconds, self.curve = (header[k] for k in ("decisions", "seconds",
-                                                                        "curve"))
-
-
-def lag(curve, fraction):
-    """Decisions from the expert's reaching a fraction of its last evaluation to the student's.
-
-    None where the student never got there.
-    """
-    tests = [(row[0], row[-2], row[-1]) for row in curve if row[-1] is not None]
-    if not tests or not tests[-1][1] > 0:
-        return None
-    goal = fraction * tests[-1][1]
-    reached = [next((t[0] for t in tests if t[i] >= goal), None) for i in (1, 2)]
-    return None if None in reached else reached[1] - reached[0]
-
-
-def command_train(args):
-    """train: an expert (Equation 1) and, with --student fac, a student that follows it (C.1)."""
-    config = from_args(ExpertConfig, args, **TRAINING_DEFAULTS)
-    planning = from_args(PlannerConfig, args, **TRAINING_BUDGET, horizon=config.horizon,
-                         discount=config.discount)
-    distilling = from_args(DistillConfig, args, **FOLLOWING_DEFAULTS)
-    _, _, _, dim_action = lookup_task(args.task)
-    quota = args.envs * EPISODE_STEPS
-    for name in ("envs", "refresh", "workers", "evaluate_every", "evaluate_episodes"):
-        if getattr(args, name) < 1:
-            raise UserError(f"{name} must be at least 1, not {getattr(args, name)}")
-    if not planning.min_std <= config.std_start <= planning.max_std:
-        raise UserError(f"training: std_start must lie between the planner's min_std and max_std "
-                        f"({planning.min_std}, {planning.max_std}), not {config.std_start}")
-    if args.steps < quota:
-        raise UserError(f"{args.envs} environments need at least {quota} steps, not {args.steps}")
-    decisions = args.steps // quota * quota  # whole rounds
-    total = int(config.updates_per_step * decisions)
-    if not args.student:
-        distilling = None
-    else:
-        args.num_agents = dim_action if args.num_agents is None else args.num_agents
-        distilling = dataclasses.replace(distilling, steps=max(1, total))
-        if distilling.horizon >= config.horizon:
-            raise UserError(f"the student's loss takes {distilling.horizon + 1} actions, the "
-                            f"expert's batches hold {config.horizon}; lower --distill-horizon or "
-                            f"raise --horizon")
-    out = output_folder(args.out or f"runs/train-{args.task}-{args.seed}")
-    training, checkpoint = Training(args, config, planning, distilling), out / "checkpoint.npz"
-    if checkpoint.exists():
-        training.load(*read_npz(checkpoint, ("checkpoint",)), checkpoint)
-    elif args.resume:
-        raise UserError(f"{checkpoint}: no such file; there is nothing to resume")
-    began = saved = time.time()
-    with contextlib.closing(Actors(args.task, min(args.workers, args.envs))) as actors, \
-            one_thread(), progress("training", total, "update", training.updates) as bar:
-        while training.decisions < decisions:
-            if args.minutes and time.time() - began > 60 * args.minutes:
-                break
-            training.round(actors, bar)
-            write_curve(out / "curve.csv", TRAINING_CURVE, training.curve)
-            if time.time() - saved > 60 or training.decisions == decisions:
-                write_npz(checkpoint, *training.state())
-                saved = time.time()
-        done = training.decisions == decisions
-        if done:
-            training.finish(total, actors, bar)
-            write_curve(out / "curve.csv", TRAINING_CURVE, training.curve)
-        write_npz(checkpoint, *training.state())
-    result = {"task": args.task, "seed": args.seed, "steps": training.decisions,
-              "updates": training.updates, "seconds": round(training.seconds, 1), "done": done,
-              "out": str(out)}
-    if not done:
-        print(f"stopped after {training.decisions:,} decisions; the same command goes on from "
-              f"{checkpoint}", file=sys.stderr)
-        return result
-    about = {"task": args.task, "seed": args.seed, "decisions": training.decisions,
-             "updates": training.updates, "minutes": round(training.seconds / 60, 1),
-             "training": dataclasses.asdict(config),
-             "training_planner": dataclasses.asdict(planning)}
-    training.buffer.write(out / "replay.npz", about)
-    models = {"expert": training.learner.model}
-    if training.student:
-        models["student"] = training.student.model
-    rows = [("", "return", "ms a decision")]
-    for kind, model in models.items():
-        header, prefix = {"kind": kind, **about}, "" if kind == "expert" else "student_"
-        if args.episodes:
-            found = evaluate(model, args.task, PlannerConfig(discount=config.discount),
-                             args.episodes, 0, None,
-                             f"evaluating the {kind}")
-            returns = found["returns"]
-            record_returns(out / f"{kind}.npz", model, found)
-            result.update({prefix + "return_mean": float(np.mean(returns)), prefix + "returns":
-                           returns, prefix + "return_std": float(np.std(returns))})
-            rows.append((kind, f"{np.mean(returns):.0f} ± {np.std(returns):.0f}",
-                         f"{found['plan_ms_median']:.1f}"))
-        save_model(out / f"{kind}.npz", model, header)
-    if training.student:
-        if args.episodes:
-            result["ratio"] = kept(result["student_return_mean"], result["return_mean"])
-        result["lag"] = {str(p): lag(training.curve, p / 100) for p in (50, 75, 90)}
-    drawn = draw_training(out / "curve.png", training.curve, f"{args.task}, seed {args.seed}")
-    checkpoint.unlink()
-    print(f"\n{args.task}: {training.decisions:,} decisions, {training.updates:,} updates, "
-          f"{training.seconds / 60:.1f} minutes; {args.episodes} evaluation episodes\n")
-    print_table(rows)
-    print(f"\n{out}/" + ("" if drawn else
-                         "\n(no picture: pip install 'fac-tdmpc-ref[plots]' draws curve.png)"))
-    return result
-
-
-def draw_training(path, curve, title):
-    """Returns over the decisions; False where matplotlib is missing."""
-    try:
-        plt = pyplot()
-    except UserError:
-        return False
-    columns = dict(zip(TRAINING_CURVE, zip(*curve)))
-    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
-    axes.plot(columns["decisions"], columns["return_mean"], alpha=0.5, label="training episodes")
-    for key, label in (("eval_expert", "expert"), ("eval_student", "student")):
-        points = [(x, y) for x, y in zip(columns["decisions"], columns[key]) if y is not None]
-        if points:
-            axes.plot(*zip(*points), marker="o", label=label)
-    axes.set(xlabel="decisions (two environment steps each)", ylabel="return", title=title)
-    axes.legend()
-    axes.grid(alpha=0.3)
-    save_figure(path, figure)
-    return True
-
-
 def command_evaluate(args):
     """evaluate: a model's returns on a task."""
     from_args(PlannerConfig, args)  # wrong settings first, then wrong files
@@ -2993,39 +2542,6 @@ def make_parser():
                      help="measure the expert's return anew instead of reading its record")
     add_config(sub, DistillConfig)
     add_config(sub, PlannerConfig, prefix="plan-", skip=("horizon", "q_alone"))
-
-    sub = add_command(commands, "train", command_train, "Train an expert in NumPy (Equation 1); "
-                      "with --student fac, distil it on the way (appendix C.1).",
-                  epilog="A run that was cut off goes on when the same command is given again. Its "
-                  "folder is what distill takes as --expert.")
-    sub.add_argument("--task", default="reacher-easy", help="one of: " + ", ".join(TASKS))
-    sub.add_argument("--steps", type=natural, default=30_000,
-                     help="decisions, two environment steps each [30000]")
-    sub.add_argument("--seed", type=natural, default=0, help="[0]")
-    sub.add_argument("--student", choices=("fac",), help="fac: after each update of the expert, "
-                     "one of a factored student on the same batch")
-    sub.add_argument("--num-agents", type=int, help="the student's N [dim(A)]")
-    sub.add_argument("--envs", type=natural, default=4, help="episodes in a round [4]")
-    sub.add_argument("--refresh", type=natural, default=25, help="decisions that an episode goes "
-                     "on with the same weights [D6] [25]")
-    sub.add_argument("--workers", type=natural, default=max(1, cores() - 1),
-                     help="processes that play them while this one learns [cores - 1]")
-    sub.add_argument("--minutes", type=float, default=0, help="stop after the round under way by "
-                     "then; 0: never [0]")
-    sub.add_argument("--resume", action="store_true", help="insist on a checkpoint in --out")
-    sub.add_argument("--out", help="folder for the results [runs/train-TASK-SEED]")
-    sub.add_argument("--episodes", type=natural, default=20, help="evaluation episodes at the end, "
-                     "with MPPI's default budget; 0: none [20]")
-    sub.add_argument("--evaluate-every", type=natural, default=4_000, help="decisions between two "
-                     "evaluations on the way [4000]")
-    sub.add_argument("--evaluate-episodes", type=natural, default=10, help="episodes in one [10]")
-    add_config(sub, ExpertConfig, **TRAINING_DEFAULTS)
-    add_config(sub, PlannerConfig, "MPPI while training", "plan-", skip=("discount", "horizon"),
-               **TRAINING_BUDGET)
-    add_config(sub, DistillConfig, "The student (Algorithm 1), on the expert's batches and steps",
-               "distill-", skip=("steps", "batch_size", "new_targets", "reuse", "own_episodes",
-                                "own_share", "held_out"),
-               **FOLLOWING_DEFAULTS)
 
     sub = add_command(commands, "evaluate", command_evaluate, "Plan with a model (expert or "
                       "student) through whole episodes.")

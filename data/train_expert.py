@@ -1,615 +1,568 @@
 #!/usr/bin/env python3
-"""Train a TD-MPC expert in PyTorch and export it for fac_tdmpc_ref.py.
+"""Train a TD-MPC expert (Equation 1) and, with --student fac, a student that follows it (C.1).
 
-    python data/train_expert.py --task reacher-hard --decisions 40000 --updates-per-step 0.5
+    python data/train_expert.py --task reacher-easy
+    python data/train_expert.py --task reacher-easy --student fac
+    python data/train_expert.py --task walker-run --backend torch --mlp-dim 512 --batch-size 512
 
-This is Equation 1 of the paper with Table 2's sizes, in the form of TD-MPC's public code:
-exponential moving-average targets, a policy that is trained through Q and proposes
-trajectories to MPPI, exploration noise that falls over the first 25,000 decisions.
-Several environments step in worker processes and are planned for as one batch.
+One loop for two learners: fac.Learner needs nothing but NumPy, PyTorch's (--backend torch) can use
+a GPU or bfloat16. While the learner learns, actors play episodes beside it in processes of their
+own, planning with fac.Planner on weights that are newer in every part of an episode.
 
-It stops cleanly after --minutes, and goes on from its last checkpoint (written after every
-round of episodes) when started again with the same --out. When all decisions are made it
-writes expert.npz, replay.npz and golden.npz into data/<task>/, and data/golden-narrow.npz.
+The folder --out then holds expert.npz and replay.npz, which `fac_tdmpc_ref.py distill --expert`
+takes, student.npz, curve.csv and curve.png. A run that was cut off, by --minutes or a kill, goes
+on from its checkpoint when the same command is given again, to the same result; one that is over
+goes on with more --steps.
 """
-import argparse
+import contextlib
 import dataclasses
-import functools
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
-import torch
-import torch.nn.functional as F
-from torch import nn
-from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import fac_tdmpc_ref as fac  # noqa: E402
 
+# for a few cores; hidden layers of 512, as in Table 2, make an update three times as dear
+TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
+FOLLOWING_DEFAULTS = {"noise_samples": 3}
+LOSSES = ("consistency", "reward", "value", "kl_reward", "kl_value")
+CURVE = ("decisions", "updates", "seconds", "exploration_std", "horizon", "return_mean",
+         "return_min", "return_max", *LOSSES, "eval_expert", "eval_student")
 
-# --------------------------------------------------------------------------------- model
 
-class Output(nn.Linear):
-    """A last layer, in its weights' precision under autocast too.
+# --------------------------------------------------------------------------------- acting
 
-    bfloat16 keeps eight bits: a Q of 100 would be a multiple of a half.
+class Episode:
+    """An episode that is played in parts, so that each can plan with newer weights.
+
+    `observation` (T + 1, O), `action` (T, A) and `reward` (T,) grow as lists. They depend on the
+    seed and on the planners that `player`, a name, stood for.
     """
 
-    def forward(self, x):
-        with torch.autocast(x.device.type, enabled=False):
-            return super().forward(x.to(self.weight.dtype))
+    def __init__(self, environment, seed, player=None, exploration_std=0.0):
+        self.environment, self.seed, self.player = environment, seed, player
+        self.exploration_std, self.rng = exploration_std, fac.stream(seed, "exploration")
+        self.observation, self.action, self.reward = [environment.reset(seed)], [], []
+        self._warm_start = None
+
+    def play(self, planner, decisions):
+        """Go on with a planner, whose actions get exploration noise, or with None: at random."""
+        if planner and self._warm_start:
+            planner.warm_start = self._warm_start
+        elif planner:
+            planner.reset(self.seed)
+        for _ in range(decisions):
+            self.action.append(self._explore(planner))
+            obs, reward = self.environment.step(self.action[-1])
+            self.observation.append(obs)
+            self.reward.append(reward)
+        self._warm_start = planner and planner.warm_start
+
+    def _explore(self, planner):
+        if planner is None:
+            return self.rng.uniform(-1, 1, self.environment.dim_action).astype(np.float32)
+        action = planner.act(self.observation[-1])
+        deviation = self.exploration_std  # in TD-MPC's code: MPPI's last one, at least this
+        noise = deviation * self.rng.standard_normal(action.shape, np.float32)
+        return np.clip(action + noise, -1, 1)
+
+    def arrays(self):
+        """Observations, actions and rewards so far, as ReplayBuffer.add takes them."""
+        return np.stack(self.observation), np.stack(self.action), np.array(self.reward, np.float32)
 
 
-def mlp(dim_in, hidden, dim_out):
-    return nn.Sequential(nn.Linear(dim_in, hidden), nn.ELU(), nn.Linear(hidden, hidden), nn.ELU(),
-                         Output(hidden, dim_out))
+def _acting_worker(connection):
+    """Plays its share of the episodes that `Actors` begin; players without a planner: at random."""
+    task, environments = connection.recv(), []
+    while True:
+        command, *values = connection.recv()
+        if command == "begin":
+            begun, planners = *values, {}
+            environments += [fac.Environment(task) for _ in begun[len(environments):]]
+            episodes = [Episode(e, *about) for e, about in zip(environments, begun)]
+        else:
+            decisions, newer = values
+            planners.update({name: fac.Planner(*planning) for name, planning in newer.items()})
+            for episode in episodes:
+                episode.play(planners.get(episode.player), decisions)
+            connection.send([episode.arrays() for episode in episodes])
 
 
-def q_network(dim_in, hidden):
-    return nn.Sequential(nn.Linear(dim_in, hidden), nn.LayerNorm(hidden), nn.Tanh(),
-                         nn.Linear(hidden, hidden), nn.ELU(), Output(hidden, 1))
+class Actors:
+    """Processes that play episodes, part by part, while this one learns."""
+
+    def __init__(self, task, workers):
+        fac.lookup_task(task)
+        self._workers, self._count = fac.Workers(_acting_worker, workers, "acting worker"), workers
+        self._workers.send_all(task)
+
+    def begin(self, episodes):
+        """Start episodes: (seed, player, exploration_std) of each."""
+        self._begun = len(episodes)
+        for i in range(self._count):
+            self._workers.send(i, ("begin", episodes[i::self._count]))
+
+    def play(self, decisions, planners):
+        """Let all go on, players with newer planners {player: (model, planner config)}."""
+        self._workers.send_all(("play", decisions, planners))
+
+    def wait(self):
+        """Until they have; (observations, actions, rewards) of every episode so far."""
+        played = self._workers.receive_all()
+        return [played[i % self._count][i // self._count] for i in range(self._begun)]
+
+    def close(self):
+        """End the processes."""
+        self._workers.close()
 
 
-class TOLD(nn.Module):
-    """TD-MPC's world model; attribute names are the official state-dict's."""
+# ------------------------------------------------------------------------------- learning
 
-    def __init__(self, dim_obs, dim_action, config):
-        super().__init__()
-        m, hidden = config.latent_dim, config.mlp_dim
-        self._encoder = nn.Sequential(nn.Linear(dim_obs, config.enc_dim), nn.ELU(),
-                                      Output(config.enc_dim, m))
-        self._dynamics = mlp(m + dim_action, hidden, m)
-        self._reward = mlp(m + dim_action, hidden, 1)
-        self._pi = mlp(m, hidden, dim_action)
-        self._Q1 = q_network(m + dim_action, hidden)
-        self._Q2 = q_network(m + dim_action, hidden)
-        for module in self.modules():
-            if isinstance(module, nn.Linear):
-                nn.init.orthogonal_(module.weight)
-                nn.init.zeros_(module.bias)
-        for network in (self._reward, self._Q1, self._Q2):
-            nn.init.zeros_(network[-1].weight)
+class NumPyLearner(fac.Learner):
+    """fac.Learner, with what the loop needs beside its `update`."""
+    about = {"backend": "numpy"}
 
-    def encode(self, obs):
-        return self._encoder(obs)
-
-    def next(self, z, a):
-        x = torch.cat([z, a], -1)
-        return self._dynamics(x), self._reward(x).squeeze(-1)
-
-    def q(self, z, a):
-        x = torch.cat([z, a], -1)
-        return self._Q1(x).squeeze(-1), self._Q2(x).squeeze(-1)
-
-    def pi(self, z, std=0.0):
-        """Policy action with Gaussian noise, cut as in TD-MPC's TruncatedNormal."""
-        mu = torch.tanh(self._pi(z))
-        if std == 0:
-            return mu
-        noise = (torch.randn_like(mu) * std).clamp(-fac.POLICY_CUT, fac.POLICY_CUT)
-        # the clamp to [-1, 1] passes gradients straight through
-        a = mu + noise
-        return a - a.detach() + a.detach().clamp(-1 + 1e-6, 1 - 1e-6)
-
-
-def equation_1(model, target, obs, action, reward, config, pi_std):
-    """Equation 1 on obs (H+1, B, O), action (H, B, A), reward (H, B): its three terms.
-
-    Means over features and batch, weights lambda^h, as in TD-MPC's code; targets don't get
-    gradients. Returns (consistency, reward, value, latents (H+1, B, m)).
-    """
-    horizon = action.shape[0]
-    with torch.no_grad():
-        s_next = target.encode(obs[1:])
-        z_next = model.encode(obs[1:])
-        td = reward + config.discount * torch.minimum(*target.q(z_next, model.pi(z_next, pi_std)))
-    z, latents = model.encode(obs[0]), []
-    consistency = reward_loss = value_loss = 0.0
-    for h in range(horizon):
-        latents.append(z)
-        q1, q2 = model.q(z, action[h])
-        z, r = model.next(z, action[h])
-        weight = config.lam ** h
-        consistency = consistency + weight * F.mse_loss(z, s_next[h])
-        reward_loss = reward_loss + weight * F.mse_loss(r, reward[h])
-        value_loss = value_loss + weight * (F.mse_loss(q1, td[h]) + F.mse_loss(q2, td[h]))
-    latents.append(z)
-    return consistency, reward_loss, value_loss, torch.stack(latents)
-
-
-class Learner:
-    """TOLD, its targets and its optimizers."""
-
-    def __init__(self, dim_obs, dim_action, config, device, precision="float32"):
-        self.config, self.updates = config, 0
-        self.autocast = functools.partial(torch.autocast, torch.device(device).type,
-                                          torch.bfloat16, enabled=precision == "bfloat16")
-        self.model = TOLD(dim_obs, dim_action, config).to(device)
-        self.target = TOLD(dim_obs, dim_action, config).to(device)
-        self.target.load_state_dict(self.model.state_dict())
-        self.target.requires_grad_(False)
-        self.q_params = [*self.model._Q1.parameters(), *self.model._Q2.parameters()]
-        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=config.lr, fused=True)
-        self.pi_optimizer = torch.optim.Adam(self.model._pi.parameters(), lr=config.lr,
-                                             fused=True)
+    def update(self, obs, actions, reward, rng):
+        """As fac.Learner's; returns the three terms of Equation 1 alone."""
+        return super().update(obs, actions, reward, rng)[0]
 
     def state(self):
-        return {"model": self.model.state_dict(), "model_target": self.target.state_dict(),
-                "optimizer": self.optimizer.state_dict(), "updates": self.updates,
-                "pi_optimizer": self.pi_optimizer.state_dict()}
+        """Everything that a resumed run needs, as arrays."""
+        return {"slow": self.slow_vector, **named("expert", self.optimizer),
+                **named("policy", self.policy_optimizer)}
 
-    def load(self, state):
-        self.model.load_state_dict(state["model"])
-        self.target.load_state_dict(state["model_target"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.pi_optimizer.load_state_dict(state["pi_optimizer"])
-        self.updates = state["updates"]
-
-    def update(self, obs, action, reward, pi_std=fac.POLICY_STD):
-        """One step of Equation 1, one of the policy, and every second time the targets."""
-        config = self.config
-        self.optimizer.zero_grad(set_to_none=True)
-        with self.autocast():
-            consistency, reward_loss, value_loss, latents = equation_1(
-                self.model, self.target, obs, action, reward, config, pi_std)
-        loss = (config.consistency_coef * consistency + config.reward_coef * reward_loss
-                + config.value_coef * value_loss) / len(action)
-        loss.backward()
-        nn.utils.clip_grad_norm_(self.model.parameters(), config.grad_clip)
-        self.optimizer.step()
-
-        for p in self.q_params:
-            p.requires_grad_(False)
-        self.pi_optimizer.zero_grad(set_to_none=True)
-        latents = latents.detach()
-        with self.autocast():
-            q = torch.minimum(*self.model.q(latents, self.model.pi(latents, pi_std)))
-        weights = config.lam ** torch.arange(len(q), device=q.device, dtype=q.dtype)
-        (-(q.mean(1) * weights).sum()).backward()
-        nn.utils.clip_grad_norm_(self.model._pi.parameters(), config.grad_clip)
-        self.pi_optimizer.step()
-        for p in self.q_params:
-            p.requires_grad_(True)
-
-        self.updates += 1
-        if self.updates % config.target_every == 0:
-            with torch.no_grad():
-                pairs = zip(self.target.parameters(), self.model.parameters())
-                for slow, fast in pairs:
-                    slow.lerp_(fast, config.tau)
-        return consistency, reward_loss, value_loss
-
-    @torch.inference_mode()
-    def plan(self, obs, mean, planner, min_std):
-        """MPPI (Equation 2) for E environments at once; exploration noise of min_std.
-
-        obs (E, O); mean (L, E, A) is the warm start. Returns actions (E, A) and the new mean.
-        """
-        length, horizon, gamma = len(mean), planner.horizon, planner.discount
-        z0 = self.model.encode(obs)
-        num_env, samples = len(obs), planner.samples
-        pi_trajs, dim_action = planner.pi_trajs, mean.shape[-1]
-        z, proposals = z0.repeat_interleave(pi_trajs, 0), []
-        for h in range(length):
-            proposals.append(self.model.pi(z, fac.POLICY_STD))
-            if h < length - 1:
-                z = self.model.next(z, proposals[-1])[0]
-        proposals = torch.stack(proposals).view(length, num_env, pi_trajs, dim_action)
-        std = torch.full_like(mean, planner.max_std)
-        start = z0.repeat_interleave(samples + pi_trajs, 0)
-        for _ in range(planner.iterations):
-            noise = torch.randn(length, num_env, samples, dim_action, device=obs.device)
-            actions = (mean[:, :, None] + std[:, :, None] * noise).clamp(-1, 1)
-            actions = torch.cat([actions, proposals], 2)
-            flat, z, value = actions.flatten(1, 2), start, 0.0
-            for h in range(horizon):
-                z, r = self.model.next(z, flat[h])
-                value = value + gamma ** h * r
-            value = value + gamma ** horizon * sum(self.model.q(z, flat[horizon])) / 2
-            value = value.view(num_env, -1).nan_to_num()
-            top, index = value.topk(planner.num_elites, 1)
-            elites = actions.gather(2, index[None, :, :, None].expand(
-                length, -1, -1, dim_action))
-            score = torch.softmax(planner.inverse_temperature * top, 1)[None, :, :, None]
-            new_mean = (score * elites).sum(2)
-            std = ((score * (elites - new_mean[:, :, None]) ** 2).sum(2)).sqrt()
-            std = std.clamp(min_std, planner.max_std)
-            mean = planner.momentum * mean + (1 - planner.momentum) * new_mean
-        chosen = torch.multinomial(score[0, :, :, 0], 1)[None, :, :, None]
-        action = elites.gather(2, chosen.expand(length, -1, -1, dim_action))[0, :, 0]
-        action = (action + min_std * torch.randn_like(action)).clamp(-1, 1)
-        return action, mean
+    def load(self, arrays):
+        """Go on from a `state`."""
+        self.slow_vector[:] = arrays["slow"]
+        restore("expert", self.optimizer, arrays)
+        restore("policy", self.policy_optimizer, arrays)
 
 
-# ------------------------------------------------------------------------------ training
+def named(name, optimizer):
+    """The state of a fac.Optimizer under its name."""
+    return {f"{name} {key}": value for key, value in optimizer.state().items()}
 
-CURVE = ("decisions", "minutes", "std", "horizon", "return_mean", "return_min", "return_max",
-         "consistency", "reward", "value")
+
+def restore(name, optimizer, arrays):
+    """Give a fac.Optimizer the state that `named` has put into arrays."""
+    optimizer.load({key: arrays[f"{name} {key}"] for key in optimizer.state()})
 
 
-def train(args, config, planner):
-    """Train until args.decisions or args.minutes.
+def make_learner(args, sizes, config):
+    """NumPy's learner or PyTorch's, both from the same fresh weights.
 
-    Returns (learner, replay, decisions, minutes, done).
+    Either has `update(obs, actions, reward, rng)`, the number of `updates` made, its `model` as
+    fac.WorldModel, `state()` and `load(arrays)`, and `about`, for the expert's file.
     """
-    torch.manual_seed(args.seed)
-    if args.threads:
-        torch.set_num_threads(args.threads)
-    _, _, dim_obs, dim_action = fac.lookup_task(args.task)
-    rng = np.random.default_rng(args.seed)
-    learner = Learner(dim_obs, dim_action, config, args.device, args.precision)
-    replay = fac.ReplayBuffer(dim_obs, dim_action, config.buffer_size, config.buffer_dtype)
-    decisions, seconds, elapsed, curve, began = 0, 0.0, 0.0, [], time.time()
-    out = Path(args.out)
-    out.mkdir(parents=True, exist_ok=True)
-    checkpoint = out / "checkpoint.pt"
-    # updates_per_step and the planner may change between two stretches of a run
-    settings = {"config": dataclasses.asdict(config), "task": args.task, "seed": args.seed,
-                "envs": args.envs}
-    del settings["config"]["updates_per_step"]
+    rng = fac.stream(args.seed, "expert")
+    if args.backend == "numpy":
+        return NumPyLearner(sizes, config, rng)
+    try:
+        import torch
+    except ImportError:
+        raise fac.UserError("--backend torch needs PyTorch: pip install torch") from None
+    from torch_learner import TorchLearner
+    torch.set_num_threads(args.threads)
+    model = fac.WorldModel.create(sizes, rng, policy=True)
+    try:
+        return TorchLearner(model, config, args.device, args.precision)
+    except (AssertionError, RuntimeError) as error:  # no such device, or none here
+        raise fac.UserError(f"--device {args.device}: {str(error).splitlines()[0]}") from None
+
+
+class OnlineStudent:
+    """Appendix C.1: Algorithm 1 on the batches, and with the expert, of a training that goes on."""
+
+    def __init__(self, expert, num_agents, config, seed):
+        self.config, self.seed, self._arena = config, seed, fac.Arena()
+        self.optimizer, self.model = fac.new_student(expert, num_agents, config, seed)
+
+    def update(self, expert, obs, actions):
+        """One step of Algorithm 1 on observations (O, B) and actions (H, A, B); its divergences."""
+        config, t = self.config, self.optimizer.adam.t
+        self._arena.rewind()
+        batch = fac.perturbed_batch(expert, self.model, obs, actions[:config.horizon + 1], config,
+                                    fac.stream(self.seed, "perturbations", t), self._arena.empty)
+        _, *divergences = fac.distill_loss(self.model, *batch, config, self.optimizer.grads,
+                                           self._arena.empty)
+        self.optimizer.step(fac.learning_rate(config, t), config.grad_clip)
+        return divergences
+
+
+def hindsight(task, buffer, where, obs, reward, rng):
+    """Give three quarters of reacher's segments another target, in place [D6].
+
+    Two thirds of these: where the finger is at a later step of the same episode; one third: drawn
+    as the task draws it. where, obs, reward: as ReplayBuffer.sample gives them. Of other tasks
+    nothing changes.
+    """
+    if not task.startswith("reacher"):
+        return
+    episode, start = where
+    later = buffer.observation[episode, rng.integers(start + 1, fac.EPISODE_STEPS + 1), 3:5]
+    moved, fresh = rng.random((2, len(start))) < [[3 / 4], [1 / 3]]
+    back = np.where(fresh, obs[0, 3:5] - fac.new_targets(obs[0], rng), later.T).T
+    fac.move_target(obs.swapaxes(1, 2), reward, back.astype(np.float32), moved, task)
+
+
+class Training:
+    """An expert that learns, the student that may follow it, and their replay.
+
+    Rounds: while the actors play `envs` episodes, with new weights every `refresh` decisions, the
+    learner makes the updates that the decisions so far allow. Everything depends on the seed, not
+    on the number of workers, and all of it is in `save`.
+    """
+
+    def __init__(self, args, config, planning, distilling):
+        _, _, dim_obs, dim_action = fac.lookup_task(args.task)
+        self.args, self.config, self.planning = args, config, planning
+        self.learner = make_learner(args, fac.ModelConfig(
+            dim_obs, dim_action, 1, config.latent_dim, config.enc_dim, config.mlp_dim), config)
+        self.student = distilling and OnlineStudent(self.learner.model, args.num_agents,
+                                                    distilling, args.seed)
+        self.buffer = fac.ReplayBuffer(dim_obs, dim_action, config.buffer_size,
+                                       np.dtype(config.buffer_dtype))
+        self.decisions, self.allowed, self.seconds, self.curve = 0, 0.0, 0.0, []
+        self.settings = {key: getattr(args, key) for key in (
+            "task", "seed", "backend", "envs", "refresh", "evaluate_every", "num_agents")}
+        self.settings["config"] = dataclasses.asdict(config)
+        self.settings["distill"] = dataclasses.asdict(distilling) if distilling else {}
+        # these, like the planner, may change between two stretches of a run
+        self.settings["config"].pop("updates_per_step")
+        self.settings["distill"].pop("steps", None)
+
+    @property
+    def models(self):
+        """What is learned, by name."""
+        student = {"student": self.student.model} if self.student else {}
+        return {"expert": self.learner.model, **student}
+
+    @property
+    def warming(self):
+        """Whether actions are still random."""
+        return self.decisions < self.config.seed_decisions
+
+    def scheduled(self):
+        """What changes over the first decisions (TD-MPC): while exploring, the planner's floor
+        min_std, which is the noise's deviation too, falls, and its horizon grows."""
+        over = [0, self.config.std_steps]
+        std = np.interp(self.decisions, over, [self.config.std_start, self.planning.min_std])
+        horizon = np.interp(self.decisions, over, [1, self.planning.horizon])
+        return {"exploration_std": float(std), "horizon": int(horizon)}
+
+    def explorer(self):
+        """The planner of training episodes, with the weights of now, as `Actors.play` takes it."""
+        if self.warming:
+            return {}
+        now = self.scheduled()
+        return {"explorer": (self.learner.model, dataclasses.replace(
+            self.planning, min_std=now["exploration_std"], horizon=now["horizon"]))}
+
+    def explorations(self):
+        """A round's training episodes, as `Actors.begin` takes them."""
+        seeds = fac.training_seeds(self.args.seed, "training episode",
+                                   self.decisions // fac.EPISODE_STEPS, self.args.envs)
+        return [(seed, "explorer", self.scheduled()["exploration_std"]) for seed in seeds]
+
+    def tests(self):
+        """An evaluation's episodes and planners, with the training's budget."""
+        seeds = fac.episode_seeds(self.args.seed + 1, self.args.evaluate_episodes)
+        return ([(seed, name) for name in self.models for seed in seeds],
+                {name: (model, self.planner_of(name, self.planning))
+                 for name, model in self.models.items()})
+
+    def planner_of(self, name, planning):
+        """How the expert or its student plans: a student as it was distilled to."""
+        if name == "expert":
+            return planning
+        return dataclasses.replace(planning, horizon=self.student.config.horizon,
+                                   q_alone=self.student.config.q_alone)
+
+    def learn(self):
+        """One update of the expert and, on the same batch, one of the student; their LOSSES."""
+        config, updates, H = self.config, self.learner.updates, self.config.horizon
+        rng = fac.stream(self.args.seed, "update", updates)
+        steps = max(H, self.student.config.horizon + 1) if self.student else H
+        obs, actions, reward, where = self.buffer.sample(rng, config.batch_size, steps)
+        hindsight(self.args.task, self.buffer, where, obs, reward, rng)
+        losses = self.learner.update(obs[:H + 1], actions[:H], reward[:H], rng)
+        losses += self.student.update(self.learner.model, obs[0], actions) if self.student else [
+            0.0, 0.0]
+        fac.check_finite({"losses are": losses}, updates + 1, config.lr)
+        return losses
+
+    def learn_until(self, updates, bar):
+        """Updates until there were so many; returns their losses."""
+        losses = []
+        while self.learner.updates < updates:
+            losses.append(self.learn())
+            bar.update()
+        return losses
+
+    def round(self, actors, bar):
+        """Episodes and the updates they allow, side by side; adds a row to the curve.
+
+        Evaluations are of the weights at the round's start: they belong to the row before.
+        """
+        envs, quota, began = self.args.envs, self.args.envs * fac.EPISODE_STEPS, time.time()
+        warming, row = self.warming, {**dict.fromkeys(CURVE), **self.scheduled()}
+        tested = self.curve and not warming and self.decisions % self.args.evaluate_every < quota
+        tests, planners = self.tests() if tested else ([], {})
+        actors.begin(self.explorations() + tests)
+        losses, start = [], self.learner.updates
+        due = 0 if warming else int(self.allowed) - start
+        for played in range(0, fac.EPISODE_STEPS, self.args.refresh):
+            end = min(played + self.args.refresh, fac.EPISODE_STEPS)
+            actors.play(end - played, {**planners, **self.explorer()})
+            losses += self.learn_until(start + due * end // fac.EPISODE_STEPS, bar)
+            episodes, planners = actors.wait(), {}
+        for episode in episodes[:envs]:
+            self.buffer.add(*episode)
+        self.decisions += quota
+        if warming and not self.warming:  # one round's behind, as later
+            losses = self.learn_until(int(self.allowed), bar)
+        self.allowed += self.config.updates_per_step * quota
+        self.seconds += time.time() - began
+        self.note(tests, episodes[envs:])
+        returns = [float(reward.sum()) for *_, reward in episodes[:envs]]
+        row.update(decisions=self.decisions, updates=self.learner.updates,
+                   seconds=round(self.seconds, 1), return_mean=float(np.mean(returns)),
+                   return_min=min(returns), return_max=max(returns))
+        row.update(zip(LOSSES, np.mean(losses, 0).tolist() if losses else ()))
+        self.curve.append(row)
+        bar.set_postfix_str(f"{self.decisions:,} decisions, return {np.mean(returns):.0f}", False)
+
+    def note(self, tests, episodes):
+        """Put an evaluation's mean returns, if there was one, into the last row."""
+        for name in dict.fromkeys(name for _, name in tests):
+            returns = [reward.sum() for (_, player), (*_, reward) in zip(tests, episodes)
+                       if player == name]
+            self.curve[-1][f"eval_{name}"] = float(np.mean(returns))
+
+    def finish(self, actors, bar):
+        """The updates that are left, and an evaluation of what came out."""
+        began = time.time()
+        self.learn_until(int(self.allowed), bar)
+        tests, planners = self.tests()
+        actors.begin(tests)
+        actors.play(fac.EPISODE_STEPS, planners)
+        self.note(tests, actors.wait())
+        self.seconds += time.time() - began
+
+    def save(self, out):
+        """Write the checkpoint and then, for it holds their rows, the curve."""
+        learned = self.learner.state()
+        if self.student:
+            learned.update(named("student", self.student.optimizer))
+        for key, value in learned.items():
+            fac.check_finite({f"weights ({key}) are": value}, self.learner.updates, self.config.lr)
+        header = {key: getattr(self, key) for key in ("settings", "decisions", "allowed", "seconds",
+                                                      "curve")}
+        fac.write_npz(out / "checkpoint.npz", {"kind": "checkpoint", **header,
+                                               "updates": self.learner.updates},
+                      {**learned, **self.buffer.state()})
+        fac.write_curve(out / "curve.csv", CURVE, [[row[key] for key in CURVE]
+                                                   for row in self.curve])
+
+    def load(self, path):
+        """Go on from what `save` wrote; UserError if it is another run's."""
+        header, arrays = fac.read_npz(path, ("checkpoint",))
+        fac.same_settings(header["settings"], self.settings, path)
+        try:
+            self.learner.load(arrays)
+            if self.student:
+                restore("student", self.student.optimizer, arrays)
+            self.buffer.load(arrays)
+            for key in ("decisions", "allowed", "seconds", "curve"):
+                setattr(self, key, header[key])
+        except KeyError as error:
+            raise fac.UserError(f"{path}: {error.args[0]}: missing; delete the file to start anew"
+                                ) from None
+
+
+def lag(curve, fraction):
+    """Decisions from the expert's reaching a fraction of its last evaluation to the student's.
+
+    None where the student never got there.
+    """
+    tests = [row for row in curve if row["eval_student"] is not None]
+    if not tests or not tests[-1]["eval_expert"] > 0:
+        return None
+    goal = fraction * tests[-1]["eval_expert"]
+    expert, student = (next((row["decisions"] for row in tests if row[key] >= goal), None)
+                       for key in ("eval_expert", "eval_student"))
+    return None if expert is None or student is None else student - expert
+
+
+# --------------------------------------------------------------------------- command line
+
+def read_settings(args):
+    """(training, planning, distillation or None) of a command line; UserError if they don't fit."""
+    config = fac.from_args(fac.ExpertConfig, args, **TRAINING_DEFAULTS)
+    planning = fac.from_args(fac.PlannerConfig, args, horizon=config.horizon,
+                             discount=config.discount)
+    distilling = fac.from_args(fac.DistillConfig, args, **FOLLOWING_DEFAULTS)
+    for name in ("envs", "refresh", "workers", "threads", "evaluate_every", "evaluate_episodes"):
+        if getattr(args, name) < 1:
+            raise fac.UserError(f"{name} must be at least 1, not {getattr(args, name)}")
+    if not planning.min_std <= config.std_start <= planning.max_std:
+        raise fac.UserError(f"training: std_start must lie between the planner's min_std and "
+                            f"max_std ({planning.min_std}, {planning.max_std}), not "
+                            f"{config.std_start}")
+    quota = args.envs * fac.EPISODE_STEPS
+    if args.steps < quota:
+        raise fac.UserError(f"{args.envs} environments need at least {quota} steps, not "
+                            f"{args.steps}")
+    args.steps -= args.steps % quota  # whole rounds
+    _, _, _, dim_action = fac.lookup_task(args.task)
+    if not args.student:
+        return config, planning, None
+    args.num_agents = dim_action if args.num_agents is None else args.num_agents
+    updates = max(1, int(config.updates_per_step * args.steps))
+    return config, planning, dataclasses.replace(distilling, steps=updates)
+
+
+def train(args):
+    """Train, or go on, until --steps or --minutes; returns the result."""
+    config, planning, distilling = read_settings(args)
+    out = fac.output_folder(args.out or f"runs/train-{args.task}-{args.seed}")
+    training, checkpoint = Training(args, config, planning, distilling), out / "checkpoint.npz"
     if checkpoint.exists():
-        saved = torch.load(checkpoint, weights_only=False, map_location=args.device)
-        fac.same_settings({key: saved["settings"][key] for key in settings}, settings, checkpoint)
-        learner.load(saved["learner"])
-        decisions, seconds, curve = (saved[key] for key in ("decisions", "seconds", "curve"))
-        elapsed = seconds
-        replay.load(saved)
-        rng.bit_generator.state = saved["rng"]
-        torch.set_rng_state(saved["torch_rng"].cpu())
-        if torch.cuda.is_available():
-            torch.cuda.set_rng_state_all([state.cpu() for state in saved.get("cuda_rng", [])])
-
-    def to_device(x):
-        return torch.as_tensor(np.ascontiguousarray(x), device=args.device)
-
-    def learn():
-        """One update on a fresh batch; returns its three loss terms."""
-        obs, action, reward = replay.sample(rng, config.batch_size, config.horizon, args.task)
-        batch = map(to_device, (obs.swapaxes(1, 2), action.swapaxes(1, 2), reward))
-        return [x.detach() for x in learner.update(*batch)]
-
-    def out_of_time():
-        return args.minutes and time.time() - began > 60 * args.minutes
-
-    done = False
-    with fac.EnvironmentPool(args.task, args.envs, args.workers) as pool, \
-            tqdm(total=args.decisions, initial=decisions, unit="decision", smoothing=0.05) as bar:
-        while decisions < args.decisions and not done:
-            obs = pool.reset(rng.integers(2 ** 31, size=args.envs).tolist())
-            episode = [obs], [], []
-            std = float(np.interp(decisions, [0, config.std_steps],
-                                  [config.std_start, planner.min_std]))
-            horizon = int(np.interp(decisions, [0, config.std_steps], [1, planner.horizon]))
-            planning = dataclasses.replace(planner, horizon=horizon, discount=config.discount)
-            warming = decisions < config.seed_decisions
-            mean = torch.zeros(planning.horizon + 1, args.envs, dim_action, device=args.device)
-            losses = []
-            for step in range(fac.EPISODE_STEPS):
-                if warming:
-                    action = rng.uniform(-1, 1, (args.envs, dim_action)).astype(np.float32)
-                else:
-                    with learner.autocast():
-                        action, mean = learner.plan(to_device(obs), mean, planning, std)
-                    mean = torch.cat([mean[1:], torch.zeros_like(mean[:1])])
-                    action = action.cpu().numpy()
-                obs, reward = pool.step(action)
-                for history, item in zip(episode, (obs, action, reward)):
-                    history.append(item)
-                quota = config.updates_per_step * args.envs
-                updates = 0 if warming else int((step + 1) * quota) - int(step * quota)
-                losses += [learn() for _ in range(updates)]
-                bar.update(args.envs)
-                if out_of_time():
-                    done = True
-                    break
-            if done:
-                break
-            for one in zip(*(np.stack(x, 1) for x in episode)):
-                replay.add(*one)
-            decisions += args.envs * fac.EPISODE_STEPS
-            returns = np.sum(episode[2], 0)
-            if warming and decisions >= config.seed_decisions:  # catch up on the random episodes
-                for _ in tqdm(range(int(config.updates_per_step * decisions)), desc="first updates",
-                              leave=False):
-                    losses.append(learn())
-            recent = [[float(x) for x in row] for row in losses[-100:]]
-            terms = np.mean(recent or [[0] * 3], 0)
-            elapsed = seconds + time.time() - began
-            bar.set_postfix_str(f"return {returns.mean():.0f} (best {returns.max():.0f}) "
-                                f"consistency {terms[0]:.4f} reward {terms[1]:.4f} "
-                                f"value {terms[2]:.3f}")
-            curve.append([decisions, round(elapsed / 60, 2), round(std, 3), horizon,
-                          *(round(float(f(returns)), 1) for f in (np.mean, np.min, np.max)),
-                          *map(float, terms)])
-            state = {"curve": curve, "settings": settings, "learner": learner.state(),
-                     "decisions": decisions, "seconds": elapsed, **replay.state(),
-                     "rng": rng.bit_generator.state, "torch_rng": torch.get_rng_state(),
-                     "cuda_rng": torch.cuda.get_rng_state_all()}
-            with fac.atomic_file(checkpoint) as file:
-                torch.save(state, file)
-            fac.write_curve(out / "curve.csv", CURVE, curve)  # after it: a kill doubles no row
-    return learner, replay, decisions, elapsed / 60, decisions >= args.decisions
+        training.load(checkpoint)
+    elif args.resume:
+        raise fac.UserError(f"{checkpoint}: no such file; there is nothing to resume")
+    left = config.updates_per_step * max(0, args.steps - training.decisions)
+    began, done = time.time(), False
+    with contextlib.closing(Actors(args.task, min(args.workers, args.envs))) as actors, \
+            fac.one_thread(), fac.progress("training", int(training.allowed + left), "update",
+                                           training.learner.updates) as bar:
+        while not done and not (args.minutes and time.time() - began > 60 * args.minutes):
+            if training.decisions < args.steps:
+                training.round(actors, bar)
+            else:
+                training.finish(actors, bar)
+                done = True
+            training.save(out)
+        if not training.curve:
+            training.save(out)
+    result = {"task": args.task, "seed": args.seed, "steps": training.decisions,
+              "updates": training.learner.updates, "seconds": round(training.seconds, 1),
+              "done": done, "out": str(out)}
+    if done:
+        return export(training, out, result)
+    print(f"stopped after {training.decisions:,} decisions; the same command goes on from "
+          f"{checkpoint}", file=sys.stderr)
+    return result
 
 
-# -------------------------------------------------------------------------------- export
-
-# golden files keep to the paper here, whatever the defaults are
-AS_PRINTED = {"horizon": 3, "lam": 0.5, "noise_std": 0.5, "noise_std_min": 0.5,
-              "clip_actions": False}
-
-
-def export(args, config, planner, learner, replay, decisions, minutes):
-    """Write data/<task>/expert.npz, replay.npz and golden.npz, and data/golden-narrow.npz."""
-    folder = Path(args.data or Path(__file__).parent) / args.task
-    _, _, dim_obs, dim_action = fac.lookup_task(args.task)
-    sizes = fac.ModelConfig(dim_obs, dim_action, 1, config.latent_dim, config.enc_dim,
-                            config.mlp_dim)
-    weights = {k: v.cpu().numpy() for k, v in learner.model.state_dict().items()}
-    about = {"task": args.task, "seed": args.seed, "decisions": decisions, "minutes": minutes,
-             "updates": learner.updates, "torch": torch.__version__, "device": str(args.device),
-             "precision": args.precision, "training": dataclasses.asdict(config),
-             "training_planner": dataclasses.asdict(planner)}
-    fac.write_npz(folder / "expert.npz",
-                  {"kind": "expert", "model": dataclasses.asdict(sizes), **about}, weights)
-    replay.write(folder / "replay.npz", about)
-    write_golden(folder, replay, config)
-    write_narrow_golden(folder.parent / "golden-narrow.npz")
-
-
-def run_network(kinds, params, name, x):
-    """A network of (N, out, in) weights on x (N, in, B): the student's layers, in PyTorch."""
-    for i, kind in enumerate(kinds):
-        if kind == "linear":
-            x = torch.baddbmm(params[f"{name}.{i}.bias"], params[f"{name}.{i}.weight"], x)
-        elif kind == "norm":
-            x = F.layer_norm(x.transpose(1, 2), x.shape[1:2]).transpose(1, 2)
-            x = x * params[f"{name}.{i}.weight"] + params[f"{name}.{i}.bias"]
-        else:
-            x = F.elu(x) if kind == "elu" else torch.tanh(x)
-    return x
-
-
-def rollout(params, z, actions):
-    """Rewards and both Q, summed over agents, (L, B, K): actions (L, A, B, K), z (N, m, B)."""
-    steps, _, batch, noise = actions.shape
-    z, outputs = z.repeat_interleave(noise, 2), []
-    for h in range(steps):
-        a = actions[h].reshape(len(z), -1, batch * noise)
-        x = torch.cat([z, a], 1)
-        outputs.append([run_network(kinds, params, name, x).sum(0).view(batch, noise)
-                        for name, kinds in fac.HEADS])
-        z = run_network(fac.MLP, params, "_dynamics", x)
-    return [torch.stack(head) for head in zip(*outputs)]
+def export(training, out, result):
+    """Write replay and models with their returns, and the picture; print a table; the result."""
+    args, config = training.args, training.config
+    about = {"task": args.task, "seed": args.seed, "decisions": training.decisions,
+             "updates": result["updates"], "minutes": round(training.seconds / 60, 1),
+             **training.learner.about, "training": dataclasses.asdict(config),
+             "training_planner": dataclasses.asdict(training.planning)}
+    training.buffer.write(out / "replay.npz", about)
+    rows = [("", "return", "ms a decision")]
+    for kind, model in training.models.items():
+        header, prefix = {"kind": kind, **about}, "" if kind == "expert" else "student_"
+        if kind == "student":
+            header["distill"] = dataclasses.asdict(training.student.config)
+        fac.save_model(out / f"{kind}.npz", model, header)
+        if args.episodes:
+            planning = fac.PlannerConfig(horizon=config.horizon, discount=config.discount)
+            found = fac.evaluate(model, args.task, training.planner_of(kind, planning),
+                                 args.episodes, label=f"evaluating the {kind}")
+            fac.record_returns(out / f"{kind}.npz", model, found)
+            returns = found["returns"]
+            mean, std = float(np.mean(returns)), float(np.std(returns))
+            result.update({f"{prefix}return_mean": mean, f"{prefix}return_std": std,
+                           f"{prefix}returns": returns})
+            rows.append((kind, f"{mean:.0f} ± {std:.0f}", f"{found['plan_ms_median']:.1f}"))
+    if training.student:
+        result["lag"] = {str(p): lag(training.curve, p / 100) for p in (50, 75, 90)}
+        if args.episodes:
+            result["ratio"] = fac.kept(result["student_return_mean"], result["return_mean"])
+    drawn = draw(out / "curve.png", training.curve, f"{args.task}, seed {args.seed}")
+    print(f"\n{args.task}: {training.decisions:,} decisions, {result['updates']:,} updates, "
+          f"{training.seconds / 60:.1f} minutes; {args.episodes} evaluation episodes\n")
+    fac.print_table(rows)
+    print(f"\n{out}/" + ("" if drawn else
+                         "\n(no picture: pip install 'fac-tdmpc-ref[plots]' draws curve.png)"))
+    return result
 
 
-def equation_4(params, features, actions, targets, agents, config):
-    """Algorithm 1's loss with autograd; targets: the expert's three (L, B, K)."""
-    z = run_network(fac.ENCODER, params, "_encoder", features)
-    z = z.reshape(agents, -1, features.shape[-1])
-    loss = 0.0
-    coefs = (config.reward_coef, config.value_coef, config.value_coef)
-    for coef, student, expert in zip(coefs, rollout(params, z, actions), targets):
-        log_s = F.log_softmax(student / config.temperature_student, -1)
-        log_e = F.log_softmax(expert / config.temperature_expert, -1)
-        to, of = (log_s, log_e) if config.kl == "forward" else (log_e, log_s)
-        kl = F.kl_div(to, of, reduction="none", log_target=True).sum(-1)
-        for h in range(len(kl)):
-            loss = loss + coef * config.lam ** h * kl[h].mean()
-    return loss
+def draw(path, curve, title):
+    """Returns over the decisions; False where matplotlib is missing."""
+    try:
+        plt = fac.pyplot()
+    except fac.UserError:
+        return False
+    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
+    for key, label, style in (("return_mean", "training episodes", {"alpha": 0.5}),
+                              ("eval_expert", "expert", {"marker": "o"}),
+                              ("eval_student", "student", {"marker": "o"})):
+        points = [(row["decisions"], row[key]) for row in curve if row[key] is not None]
+        if points:
+            axes.plot(*zip(*points), label=label, **style)
+    axes.set(xlabel="decisions (two environment steps each)", ylabel="return", title=title)
+    axes.legend()
+    axes.grid(alpha=0.3)
+    fac.save_figure(path, figure)
+    return True
 
 
-def alive_student(sizes, rng, dtype):
-    """A fresh student, its zero layers drawn too so that every gradient is alive, in PyTorch."""
-    student = fac.WorldModel.create(sizes, rng, dtype=np.float32)
-    for key, value in student.params.items():
-        if not value.any() and key.endswith("weight"):
-            value += 0.1 * rng.standard_normal(value.shape, np.float32)
-    return {k: torch.tensor(v, dtype=dtype, requires_grad=not k.startswith("_expert"))
-            for k, v in student.params.items()}
-
-
-def ten_adam_steps(params, loss_function, lr, clip):
-    """Ten steps with clipping, in place; returns the ten losses."""
-    trained = [p for p in params.values() if p.requires_grad]
-    optimizer, losses = torch.optim.Adam(trained, lr=lr), []
-    for _ in range(10):
-        optimizer.zero_grad()
-        loss = loss_function()
-        loss.backward()
-        nn.utils.clip_grad_norm_(trained, clip)
-        optimizer.step()
-        losses.append(loss.item())
-    return np.array(losses)
-
-
-def gradients(loss, params):
-    """Gradients of named parameters as arrays (zeros where a parameter has none)."""
-    values = [p for p in params.values() if p.requires_grad]
-    found = iter(torch.autograd.grad(loss, values, allow_unused=True, materialize_grads=True))
-    return {k: next(found).numpy() for k, p in params.items() if p.requires_grad}
-
-
-def last_axis(x):
-    """(..., B, F) of PyTorch to (..., F, B) of fac_tdmpc_ref."""
-    return x.detach().transpose(-1, -2).numpy()
-
-
-def expert_golden(model, target, obs, action, reward, config):
-    """What a TOLD computes: networks on obs[0], action[0]; Equation 1 and its gradients."""
-    z = model.encode(obs[0])
-    z_next, r = model.next(z, action[0])
-    q1, q2 = model.q(z, action[0])
-    found = {"latent": last_axis(z), "next_latent": last_axis(z_next),
-             "reward": r.detach().numpy(), "q1": q1.detach().numpy(), "q2": q2.detach().numpy(),
-             "policy": last_axis(model.pi(z))}
-    terms = equation_1(model, target, obs, action, reward, config, 0.0)[:3]
-    loss = (config.consistency_coef * terms[0] + config.reward_coef * terms[1]
-            + config.value_coef * terms[2]) / len(action)
-    found["equation1_terms"] = np.array([t.item() for t in terms])
-    found["equation1_loss"] = np.array(loss.item())
-    named = {k: v for k, v in model.named_parameters() if not k.startswith("_pi")}
-    return found, gradients(loss, named)
-
-
-def write_golden(folder, replay, config):
-    """golden.npz: the exported expert on its own replay, in float64 from its float32 weights."""
-    expert, header = fac.load_model(folder / "expert.npz")
-    _, arrays = fac.read_npz(folder / "expert.npz", ("expert",))
-    rng = np.random.default_rng(0)
-    model = TOLD(expert.config.dim_obs, expert.config.dim_action, config).double()
-    model.load_state_dict({k: torch.tensor(v).double() for k, v in arrays.items()})
-    obs, action, reward = replay.sample(rng, 16, config.horizon, "")
-    double = [torch.tensor(x).double() for x in (obs.swapaxes(1, 2), action.swapaxes(1, 2), reward)]
-    found, eq1_grads = expert_golden(model, model, *double, config)
-    found.update({f"equation1_grad {k}": fac.digest(g) for k, g in eq1_grads.items()})
-    found.update(obs=obs, action=action, rewards=reward)
-
-    # one refinement of MPPI (Equation 2) with fixed noise
-    planner = fac.PlannerConfig(samples=64, elites=8, pi_trajs=0)
-    dim_action = expert.config.dim_action
-    noise = rng.standard_normal((planner.horizon + 1, dim_action, planner.samples), np.float32)
-    mean = rng.uniform(-0.5, 0.5, (planner.horizon + 1, dim_action)).astype(np.float32)
-    actions = (torch.tensor(mean)[..., None] + planner.max_std * torch.tensor(noise)).clamp(-1, 1)
-    actions = actions.double().transpose(1, 2)
-    with torch.no_grad():
-        z, value = model.encode(double[0][0, :1]).expand(planner.samples, -1), 0.0
-        for h in range(planner.horizon):
-            z_next, r = model.next(z, actions[h])
-            value, z = value + planner.discount ** h * r, z_next
-        value = value + planner.discount ** planner.horizon * sum(model.q(z, actions[-1])) / 2
-        top, index = value.topk(planner.num_elites)
-        score = torch.softmax(planner.inverse_temperature * top, 0)[None, :, None]
-        refined = (score * actions[:, index]).sum(1)
-        std = (score * (actions[:, index] - refined[:, None]) ** 2).sum(1).sqrt()
-    found.update(mppi_noise=noise, mppi_mean=mean, mppi_returns=value.numpy(),
-                 mppi_elites=np.sort(index.numpy()), mppi_refined=refined.numpy(),
-                 mppi_std=std.clamp(planner.min_std, planner.max_std).numpy())
-
-    # Equation 4 for a fresh student of the default preset, N = dim(A)
-    distill = fac.DistillConfig(batch_size=8, noise_samples=10, **AS_PRINTED)
-    sizes = fac.student_config(expert.config, dim_action, distill.sizes, distill.encoder_input)
-    params = alive_student(sizes, rng, torch.float64)
-    found.update({f"student {k}": v.detach().numpy().astype(np.float32) for k, v in params.items()
-                  if not k.startswith("_expert")})
-    starts = rng.integers(fac.EPISODE_STEPS - 4, size=8)
-    actions = replay.action[0, starts + np.arange(4)[:, None]].swapaxes(1, 2)[..., None]
-    actions = actions + distill.noise_std * rng.standard_normal(
-        (*actions.shape[:3], distill.noise_samples), np.float32)
-    with torch.no_grad():
-        latent = model.encode(torch.tensor(replay.observation[0, starts]).double()).T[None]
-        theirs = {k: torch.tensor(v).double() for k, v in expert.params.items()}
-        targets = rollout(theirs, latent, torch.tensor(actions).double())
-
-    def loss():
-        return equation_4(params, latent, torch.tensor(actions).double(), targets, dim_action,
-                          distill)
-
-    found.update(kl_obs=replay.observation[0, starts].T, kl_actions=actions.astype(np.float32),
-                 kl_loss=np.array(loss().item()))
-    found.update({f"kl_grad {k}": fac.digest(g) for k, g in gradients(loss(), params).items()})
-    found["adam_losses"] = ten_adam_steps(params, loss, distill.lr, distill.grad_clip)
-    found.update({f"adam {k}": fac.digest(v.detach().numpy()) for k, v in params.items()
-                  if not k.startswith("_expert")})
-    fac.write_npz(folder / "golden.npz", {"kind": "golden", "task": header["task"],
-                  "training": dataclasses.asdict(config), "planner": dataclasses.asdict(planner),
-                  "distill": dataclasses.asdict(distill), "student": dataclasses.asdict(sizes)},
-                  found)
-
-
-def write_narrow_golden(path):
-    """golden-narrow.npz: small random networks, N = 1, 2, 3, 6, with everything in full."""
-    rng, found = np.random.default_rng(1), {}
-    config = fac.ExpertConfig(latent_dim=5, enc_dim=16, mlp_dim=24)
-    torch.manual_seed(0)
-    model, target = TOLD(7, 6, config).double(), TOLD(7, 6, config).double()
-    with torch.no_grad():
-        for p in [*model.parameters(), *target.parameters()]:
-            p.copy_((p + 0.1 * torch.randn_like(p)).float())  # float32 values
-    draw = [rng.standard_normal((4, 8, 7)), rng.uniform(-1, 1, (3, 8, 6)),
-            rng.standard_normal((3, 8))]
-    draw = [x.astype(np.float32) for x in draw]
-    outputs, grads = expert_golden(model, target, *(torch.tensor(x).double() for x in draw), config)
-    found.update(outputs, obs=draw[0].swapaxes(1, 2), action=draw[1].swapaxes(1, 2),
-                 rewards=draw[2])
-    for prefix, network in (("model", model), ("target", target)):
-        found.update({f"{prefix} {k}": v.numpy().astype(np.float32)
-                      for k, v in network.state_dict().items()})
-    found.update({f"equation1_grad {k}": g for k, g in grads.items()})
-    configs = {}
-    for n in (1, 2, 3, 6):
-        for kind in ("forward", "reverse"):
-            tag = f"{n} {kind}"
-            distill = fac.DistillConfig(kl=kind, noise_samples=4, grad_clip=0.05,
-                                        temperature_student=0.7, **{**AS_PRINTED, "horizon": 2})
-            sizes = fac.ModelConfig(7, 6, n, 4, 16, 24)
-            params = alive_student(sizes, rng, torch.float64)
-            features = rng.standard_normal((1, 7, 5)).astype(np.float32)
-            actions = rng.uniform(-1, 1, (3, 6, 5, 4)).astype(np.float32)
-            targets = rng.standard_normal((3, 3, 5, 4)).astype(np.float32)
-            double = [torch.tensor(x).double() for x in (features, actions, targets)]
-            loss = lambda: equation_4(params, *double, n, distill)  # noqa: B023, E731
-            found.update({f"{tag} weight {k}": v.detach().numpy().astype(np.float32)
-                          for k, v in params.items()})
-            with torch.no_grad():
-                z = run_network(fac.ENCODER, params, "_encoder", double[0]).reshape(n, -1, 5)
-                outputs = torch.stack(rollout(params, z, double[1])).numpy()
-            found.update({f"{tag} features": features, f"{tag} actions": actions,
-                          f"{tag} targets": targets, f"{tag} outputs": outputs,
-                          f"{tag} loss": np.array(loss().item())})
-            found.update({f"{tag} grad {k}": g for k, g in gradients(loss(), params).items()})
-            found[f"{tag} adam_losses"] = ten_adam_steps(params, loss, 1e-3, distill.grad_clip)
-            found.update({f"{tag} adam {k}": v.detach().numpy() for k, v in params.items()})
-            configs[tag] = {"distill": dataclasses.asdict(distill),
-                            "student": dataclasses.asdict(sizes)}
-    # float32 keeps seven digits, more than the tests ask for
-    found = {k: v.astype(np.float32) for k, v in found.items()}
-    fac.write_npz(path, {"kind": "golden", "training": dataclasses.asdict(config),
-                         "configs": configs}, found)
+def make_parser():
+    """The command line, generated from the configs of fac_tdmpc_ref."""
+    parser = fac.Parser(
+        prog="train_expert.py", description="Train a TD-MPC expert (Equation 1); with --student "
+        "fac, distil it on the way (appendix C.1).", epilog="A run that was cut off goes on when "
+        "the same command is given again. Its folder is what distill takes as --expert.")
+    add, natural = parser.add_argument, fac.natural
+    add("--task", default="reacher-easy", help="one of: " + ", ".join(fac.TASKS))
+    add("--steps", type=natural, default=30_000, help="decisions in all, two environment steps "
+        "each; a run that is over goes on with more [30000]")
+    add("--seed", type=natural, default=0, help="[0]")
+    add("--student", choices=("fac",), help="fac: after each update of the expert, one of a "
+        "factored student on the same batch")
+    add("--num-agents", type=int, help="the student's N [dim(A)]")
+    add("--backend", choices=("numpy", "torch"), default="numpy", help="what learns [numpy]")
+    add("--device", help="torch: cpu or cuda [cuda where there is one]")
+    add("--precision", choices=("float32", "bfloat16"), default="float32", help="torch: of hidden "
+        "layers' products; weights and outputs stay float32 [float32]")
+    add("--threads", type=natural, default=1, help="torch: of the updates [1]")
+    add("--envs", type=natural, default=4, help="episodes in a round [4]")
+    add("--refresh", type=natural, default=25, help="decisions that an episode goes on with the "
+        "same weights [D6] [25]")
+    add("--workers", type=natural, default=max(1, fac.cores() - 1), help="processes that play "
+        "them while this one learns [cores - 1]")
+    add("--minutes", type=float, default=0, help="stop after the round under way by then; 0: "
+        "never [0]")
+    add("--resume", action="store_true", help="insist on a checkpoint in --out")
+    add("--out", help="folder for the results [runs/train-TASK-SEED]")
+    add("--episodes", type=natural, default=20, help="evaluation episodes at the end, with MPPI's "
+        "default budget; 0: none [20]")
+    add("--evaluate-every", type=natural, default=4_000, help="decisions between two evaluations "
+        "on the way [4000]")
+    add("--evaluate-episodes", type=natural, default=10, help="episodes in one [10]")
+    add("--json", action="store_true", help="print one JSON object as the last line of stdout")
+    fac.add_config(parser, fac.ExpertConfig, **TRAINING_DEFAULTS)
+    fac.add_config(parser, fac.PlannerConfig, "MPPI while training", "plan-",
+                   skip=("discount", "q_alone"))
+    fac.add_config(parser, fac.DistillConfig, "The student (Algorithm 1), on the expert's batches "
+                   "and steps", "distill-", skip=("steps", "batch_size", "reuse", "new_targets",
+                                                  "own_episodes", "own_share", "held_out"),
+                   **FOLLOWING_DEFAULTS)
+    parser.set_defaults(run=train)
+    return parser
 
 
 def main(argv=None):
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--task", default="reacher-hard")
-    parser.add_argument("--decisions", type=fac.natural, default=100_000,
-                        help="decisions in all, two environment steps each [100000]")
-    parser.add_argument("--seed", type=fac.natural, default=1)
-    parser.add_argument("--envs", type=fac.natural, default=8,
-                        help="environments stepped side by side [8]")
-    parser.add_argument("--workers", type=int, default=max(1, fac.cores() // 2),
-                        help="processes that step them, at least one")
-    parser.add_argument("--threads", type=int, default=0, help="PyTorch threads; 0: its default")
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--precision", choices=("float32", "bfloat16"), default="float32",
-                        help="of hidden layers' products; weights and outputs stay float32")
-    parser.add_argument("--minutes", type=float, default=0, help="stop after this time; 0: never")
-    parser.add_argument("--out", default=None, help="checkpoint directory [runs/expert-<task>]")
-    parser.add_argument("--data", default=None, help="where to export [this script's folder]")
-    fac.add_config(parser, fac.ExpertConfig)
-    few = fac.TRAINING_BUDGET
-    fac.add_config(parser, fac.PlannerConfig, "MPPI while training", "plan-",
-                   skip=("discount", "output"), **few)
-    args = parser.parse_args(argv)
-    args.out = args.out or f"runs/expert-{args.task}"
-    try:
-        if not args.decisions >= args.envs * fac.EPISODE_STEPS > 0:
-            raise fac.UserError(f"--decisions {args.decisions} and --envs {args.envs}: needs at "
-                                f"least one environment and an episode ({fac.EPISODE_STEPS} "
-                                f"decisions) in each")
-        config = fac.from_args(fac.ExpertConfig, args)
-        planner = fac.from_args(fac.PlannerConfig, args, **few)
-        learner, replay, decisions, minutes, done = train(args, config, planner)
-        if not done:
-            print(f"stopped after {decisions} decisions; the same command goes on from "
-                  f"{args.out}/checkpoint.pt (a round of episodes that was under way is lost)",
-                  file=sys.stderr)
-        else:
-            export(args, config, planner, learner, replay, decisions, round(minutes, 1))
-    except fac.UserError as error:
-        print(f"train_expert.py: error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    """Run the command line; returns the exit status."""
+    return fac.run_command(make_parser(), argv)
 
 
 if __name__ == "__main__":

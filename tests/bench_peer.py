@@ -207,18 +207,17 @@ def distillation(threads, turns):
 def training(threads, turns, batch=256):
     """(ratio, our ms, PyTorch's ms) of an update of Equation 1, policy and averages included."""
     sys.path.insert(0, str(fac.DATA))
-    import train_expert
+    from torch_learner import TorchLearner
     config, rng = fac.ExpertConfig(batch_size=batch), np.random.default_rng(0)
     ours = fac.Learner(fac.ModelConfig(24, 6), config, rng)
-    theirs = train_expert.Learner(24, 6, config, "cpu")
+    theirs = TorchLearner(fac.WorldModel.create(ours.model.config, rng, policy=True), config, "cpu")
     obs = rng.standard_normal((4, 24, batch), np.float32)
     reward = rng.random((3, batch), np.float32)
     actions = rng.uniform(-1, 1, (3, 6, batch)).astype(np.float32)
-    their_batch = [torch.tensor(x) for x in (obs.swapaxes(1, 2), actions.swapaxes(1, 2), reward)]
     torch.set_num_threads(threads)
     with fac._thread_pools().limit(limits=threads, user_api="blas"):
-        return ratios(lambda: ours.update(obs, actions, reward, rng),
-                      lambda: theirs.update(*their_batch), turns)
+        return ratios(*(lambda learner=learner: learner.update(obs, actions, reward, rng)
+                        for learner in (ours, theirs)), turns)
 
 
 def main():

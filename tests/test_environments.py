@@ -14,6 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 import fac_tdmpc_ref as fac  # noqa: E402
+import train_expert  # noqa: E402
 
 FIGURE_3 = {  # task: (dim O, dim A), copied from the paper and not from the code
     "reacher-easy": (8, 3), "reacher-hard": (8, 3), "hopper-hop": (15, 4), "fish-swim": (24, 5),
@@ -155,7 +156,7 @@ def test_extreme_actions_are_the_limits_of_the_robot(task, monkeypatch):
     ("reacher-hart", "reacher-hard"), ("walker_walk", "walker-walk"), ("cheetah", "cheetah-run"),
     ("Humanoid-Stand", "humanoid-stand"), ("quadruped-runs", "quadruped-run")])
 def test_unknown_task_is_told_the_nearest_and_all_known_ones(typed, meant):
-    for refuse in (fac.lookup_task, fac.Environment, lambda t: fac.EnvironmentPool(t, 1, 1)):
+    for refuse in (fac.lookup_task, fac.Environment, lambda t: train_expert.Actors(t, 1)):
         with pytest.raises(fac.UserError) as caught:
             refuse(typed)
         message = str(caught.value)
@@ -183,10 +184,8 @@ def test_mujoco_is_imported_when_an_environment_is_made_and_not_before():
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("call", ["fac.Environment('reacher-hard')",
-                                  "fac.EnvironmentPool('reacher-hard', 1, 1).reset([0])"])
-def test_a_bad_rendering_setting_is_explained(call):
-    done = python(f"import fac_tdmpc_ref as fac\ntry: {call}\n"
+def test_a_bad_rendering_setting_is_explained():
+    done = python("import fac_tdmpc_ref as fac\ntry: fac.Environment('reacher-hard')\n"
                   "except fac.UserError as error: print(error)", MUJOCO_GL="nonsense")
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
     assert "MUJOCO_GL" in done.stdout and "'nonsense'" in done.stdout
@@ -340,27 +339,3 @@ def test_new_targets_lie_where_the_task_draws_them():
         env.reset(seed)
         seen.append(np.linalg.norm(env._env.physics.named.data.geom_xpos["target", :2]))
     assert 0.05 <= min(seen) < 0.06 and 0.19 < max(seen) <= 0.2
-
-
-# environments in processes ------------------------------------------------------------
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_pool_equals_single_environments(workers):
-    task, seeds = "reacher-easy", [3, 4, 5]
-    actions = actions_for(task, 3 * 3).reshape(3, 3, -1)
-    with fac.EnvironmentPool(task, 3, workers) as pool:
-        obs = [pool.reset(seeds)]
-        rewards = []
-        for a in actions:
-            after, reward = pool.step(a)
-            obs.append(after)
-            rewards.append(reward)
-    assert rewards[0].dtype == np.float32 and obs[0].dtype == np.float32
-    for b, seed in enumerate(seeds):
-        env = environment(task)
-        np.testing.assert_array_equal(obs[0][b], env.reset(seed))
-        for t in range(3):
-            after, reward = env.step(actions[t, b])
-            np.testing.assert_array_equal(obs[t + 1][b], after)
-            assert rewards[t][b] == np.float32(reward)

@@ -1,6 +1,5 @@
 """Equation 1 and the policy's loss: central differences, golden files, ten updates of PyTorch's."""
 import dataclasses
-import importlib.util
 
 import numpy as np
 import pytest
@@ -119,52 +118,40 @@ def test_golden_loss_and_gradients(source, dtype):
             assert_digest(gradient, expected, bound, size)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="needs PyTorch")
 @pytest.mark.parametrize("dtype, tolerance", [(np.float64, 1e-9), (np.float32, 2e-3)])
-def test_ten_updates_are_pytorch_s(dtype, tolerance, monkeypatch):
+def test_ten_updates_are_pytorch_s(dtype, tolerance):
     """Adam divides a gradient by its own size: in float32, rounding moves small ones visibly."""
-    import torch
-    import train_expert
-    monkeypatch.setattr(fac, "POLICY_STD", 0)  # the two draw different numbers
-    rng = np.random.default_rng(3)
-    ours = small_learner(rng, dtype)
-    config = dataclasses.replace(CONFIG, grad_clip=0.5, tau=0.1)
-    ours.config = config
-    theirs = train_expert.Learner(4, 2, config, "cpu")
-    for network, model in ((theirs.model, ours.model), (theirs.target, ours.target)):
-        network.to(getattr(torch, np.dtype(dtype).name))
-        params = dict(network.named_parameters())
-        with torch.no_grad():
-            for key, value in model.params.items():
-                params[key].copy_(torch.tensor(value).reshape(params[key].shape))
-    # the moving average has a policy of its own in PyTorch's form, which nothing reads
+    pytest.importorskip("torch")
+    from torch_learner import TorchLearner, torch
+    ours = small_learner(np.random.default_rng(3), dtype)
+    ours.config = dataclasses.replace(CONFIG, grad_clip=0.5, tau=0.1)
+    copy = {k: v.copy() for k, v in ours.model.params.items()}
+    theirs = TorchLearner(fac.WorldModel(ours.model.config, copy), ours.config, "cpu")
+    for key, value in ours.target.params.items():
+        theirs.target[key].copy_(torch.tensor(value))
     for t in range(10):
-        obs, actions, reward = small_batch(np.random.default_rng(t), dtype=dtype)
-        found, _ = ours.update(obs, actions, reward, rng)
-        expected = theirs.update(*(torch.tensor(np.ascontiguousarray(x.swapaxes(-1, -2)))
-                                   if x.ndim == 3 else torch.tensor(x)
-                                   for x in (obs, actions, reward)), 0.0)
-        assert_close(np.array(found), np.array([x.item() for x in expected]), 10 * tolerance)
-    for model, network in ((ours.model, theirs.model), (ours.target, theirs.target)):
-        params = dict(network.named_parameters())
+        batch = small_batch(np.random.default_rng(t), dtype=dtype)
+        found, _ = ours.update(*batch, np.random.default_rng(t))
+        expected = theirs.update(*batch, np.random.default_rng(t))
+        assert_close(np.array(found), np.array(expected), 10 * tolerance)
+    for model, params in ((ours.model, theirs.model.params), (ours.target, theirs.target)):
+        assert set(model.params) == set(params)
         for key, value in model.params.items():
-            assert_close(value.ravel(), params[key].detach().numpy().ravel(), tolerance)
+            assert_close(value, np.asarray(params[key]), tolerance)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="needs PyTorch")
 def test_half_precision_ends_at_the_last_layer():
-    import torch
-    import train_expert
-    torch.manual_seed(0)
-    model = train_expert.TOLD(4, 2, CONFIG)
-    torch.nn.init.normal_(model._Q1[-1].weight)
-    z, a = torch.randn(50, CONFIG.latent_dim), torch.randn(50, 2)
-    learner = train_expert.Learner(4, 2, CONFIG, "cpu", "bfloat16")
-    with torch.no_grad(), learner.autocast():
-        half = model.q(z, a)[0] + 100
-        half -= 100
+    pytest.importorskip("torch")
+    from torch_learner import TorchLearner, heads, torch
+    learner = TorchLearner(small_learner(np.random.default_rng(0), np.float32).model, CONFIG,
+                           "cpu", "bfloat16")
+    x = torch.randn(1, 50, CONFIG.latent_dim + 2)
+    torch.nn.init.normal_(learner.params["_Q1.5.weight"])
     with torch.no_grad():
-        whole = model.q(z, a)[0]
+        with learner._autocast():
+            half = heads(learner.params, x)[1] + 100
+            half -= 100
+        whole = heads(learner.params, x)[1]
     assert half.dtype == torch.float32
     assert 0 < (half - whole).abs().max() < 0.03 * whole.std()  # bfloat16's steps at 100 are 0.5
 

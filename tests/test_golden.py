@@ -2,6 +2,8 @@
 
 The references are float64 results on float32 weights; ours are float32.
 """
+import shutil
+
 import numpy as np
 import pytest
 
@@ -196,3 +198,60 @@ def test_narrow_expert_forward():
     for name, found in (("latent", z), ("next_latent", model.next(z, a)), ("q1", q1), ("q2", q2),
                         ("reward", model.reward(z, a)), ("policy", model.policy(z))):
         assert relative(found[0], g[name]) < FORWARD, name
+
+
+# ------------------------------------------------------- PyTorch itself, on the same inputs
+
+@pytest.fixture
+def export_golden():
+    torch = pytest.importorskip("torch")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # more of them wait for a busy core
+    import export_golden
+    yield export_golden
+    torch.set_num_threads(threads)
+
+
+def settings_of(config_class, header, name):
+    return config_class(**present(config_class, header[name]))
+
+
+def assert_same(found, stored, tolerance):
+    for key, value in found.items():
+        if not key.endswith(tuple(fac.UNSEEN)):
+            assert relative(np.asarray(value).reshape(stored[key].shape), stored[key]) < tolerance
+
+
+def test_pytorch_computes_what_a_golden_file_holds(golden, export_golden):
+    expert, header, g = golden
+    found = export_golden.task_golden(expert, g, settings_of(fac.ExpertConfig, header, "training"),
+                                      settings_of(fac.PlannerConfig, header, "planner"),
+                                      settings_of(fac.DistillConfig, header, "distill"))
+    assert {"kl_loss", "mppi_elites", "equation1_loss", "adam_losses"} <= set(found) <= set(g)
+    assert_same(found, g, 1e-9)
+
+
+def test_pytorch_computes_what_the_narrow_file_holds(export_golden):
+    header, g = fac.read_npz(NARROW, ("golden",))
+    experts = [narrow_expert(header, g, prefix).params for prefix in ("model ", "target ")]
+    found = export_golden.expert_golden(*experts, g, settings_of(fac.ExpertConfig, header,
+                                                                 "training"))
+    assert_same(found, g, 1e-6)  # kept as float32
+    for tag, config in header["configs"].items():
+        distill = settings_of(fac.DistillConfig, config, "distill")
+        assert_same(export_golden.narrow_golden(g, tag, config["student"]["num_agents"], distill),
+                    g, 1e-6)
+
+
+def test_the_export_writes_files_of_the_same_entries(tmp_path, export_golden):
+    (tmp_path / "reacher-hard").mkdir()
+    for name in ("expert.npz", "replay.npz"):
+        shutil.copy(fac.DATA / "reacher-hard" / name, tmp_path / "reacher-hard")
+    assert export_golden.main(["--data", str(tmp_path)]) == 0
+    for name in ("reacher-hard/golden.npz", "golden-narrow.npz"):
+        header, found = fac.read_npz(tmp_path / name, ("golden",))
+        shipped, expected = fac.read_npz(fac.DATA / name, ("golden",))
+        assert set(header) == set(shipped)
+        assert {k: (v.shape, v.dtype) for k, v in found.items()} == {
+            k: (v.shape, v.dtype) for k, v in expected.items()}
+    assert export_golden.main(["--data", str(tmp_path), "walker-walk"]) == 2

@@ -198,7 +198,7 @@ shapes = st.tuples(st.integers(1, 4), st.integers(1, 7), st.integers(2, 8), st.i
 @given(shapes, st.integers(0, 2 ** 31))
 def test_networks_against_torch(shape, seed):
     torch = pytest.importorskip("torch")
-    import train_expert
+    import torch_learner
     n, inputs, hidden, batch = shape
     rng = np.random.default_rng(seed)
     config = fac.ModelConfig(3, n * 2, n, inputs, 5, hidden)
@@ -209,7 +209,7 @@ def test_networks_against_torch(shape, seed):
     for name, kinds in (("_dynamics", fac.MLP), ("_Q1", fac.QNET)):
         theirs = {k: torch.tensor(v, requires_grad=True) for k, v in model.params.items()}
         their_x = torch.tensor(x, requires_grad=True)
-        output = train_expert.run_network(kinds, theirs, name, their_x)
+        output = torch_learner.network(kinds, theirs, name, their_x.mT).mT
         dy = rng.standard_normal(output.shape)
         (output * torch.tensor(dy)).sum().backward()
         tape, grads = [], {k: np.zeros_like(v) for k, v in model.params.items()}
@@ -226,16 +226,16 @@ def test_networks_against_torch(shape, seed):
        st.sampled_from(["forward", "reverse"]), st.integers(0, 2 ** 31))
 def test_distill_loss_against_torch(n, batch, steps, kind, seed):
     torch = pytest.importorskip("torch")
-    import train_expert
+    import export_golden
     student, features, actions, targets, config = small_case(n, batch, steps, kind,
                                                              np.random.default_rng(seed))
     theirs = {k: torch.tensor(v, requires_grad=True) for k, v in student.params.items()}
-    loss = train_expert.equation_4(theirs, torch.tensor(features), torch.tensor(actions),
+    loss = export_golden.equation_4(theirs, torch.tensor(features), torch.tensor(actions),
                                    [torch.tensor(t) for t in targets], n, config)
     grads = {k: np.zeros_like(v) for k, v in student.params.items()}
     ours = fac.distill_loss(student, features, actions, targets, config, grads)[0]
     assert np.isclose(ours, loss.item(), rtol=1e-10)
-    for key, expected in train_expert.gradients(loss, theirs).items():
+    for key, expected in export_golden.gradients(loss, theirs).items():
         assert_close(grads[key], expected, 1e-7)
 
 

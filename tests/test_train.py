@@ -1,7 +1,8 @@
-"""Training in NumPy: the buffer, rounds that don't depend on workers, checkpoints, the CLI."""
+"""Training: the buffer, rounds that don't depend on workers, checkpoints, learners, the CLI."""
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -11,12 +12,19 @@ import numpy as np
 import pytest
 
 import fac_tdmpc_ref as fac
-from test_cli import last_json, refused, run, succeeded
+import train_expert
+from test_cli import ONE_THREAD, ROOT, WATCHED, last_json, launch, refused, run, succeeded
+
+SCRIPT = ROOT / "data" / "train_expert.py"
 
 TINY = ["--task", "reacher-easy", "--steps", "3000", "--envs", "2", "--seed-decisions", "1000",
         "--updates-per-step", "0.01", "--batch-size", "8", "--mlp-dim", "16", "--enc-dim", "8",
         "--latent-dim", "6", "--plan-samples", "8", "--plan-iterations", "1", "--evaluate-every",
         "2000", "--evaluate-episodes", "1", "--student", "fac", "--workers", "1", "--episodes", "0"]
+
+
+def train(*arguments, cwd):
+    return launch([SCRIPT, *TINY, *arguments], cwd)
 
 
 def episode(rng, value):
@@ -31,10 +39,12 @@ def test_the_buffer_drops_the_oldest_and_writes_a_replay(tmp_path, dtype):
     for value in (1, 2, 3):
         buffer.add(*episode(rng, value))
     assert len(buffer) == 2
-    obs, action, reward = buffer.sample(rng, 50, 3, "walker-walk")
+    obs, action, reward, (episodes, start) = buffer.sample(rng, 50, 3)
     assert obs.shape == (4, 8, 50) and action.shape == (3, 3, 50) and reward.shape == (3, 50)
     assert obs.dtype == action.dtype == reward.dtype == np.float32
     assert set(np.unique(obs)) == {2, 3} and np.array_equal(reward, obs[:3, 0])
+    for h in range(3):
+        assert np.array_equal(action[h].T, buffer.action[episodes, start + h].astype(np.float32))
     buffer.write(tmp_path / "replay.npz", {"task": "reacher-easy"})
     replay = fac.Replay(tmp_path / "replay.npz")
     assert replay.transitions == 2 * fac.EPISODE_STEPS
@@ -47,8 +57,13 @@ def test_segments_are_in_order_and_most_get_other_targets():
     buffer = fac.ReplayBuffer(8, 3, fac.EPISODE_STEPS)
     walk = np.cumsum(rng.standard_normal((501, 8)) * 0.1 + 1, 0).astype(np.float32)
     buffer.add(walk, rng.uniform(-1, 1, (500, 3)), np.zeros(500))
-    obs, _, reward = buffer.sample(rng, 400, 3, "reacher-easy")
+    obs, _, reward, where = buffer.sample(rng, 400, 3)
+    before = obs.copy(), reward.copy()
+    train_expert.hindsight("walker-walk", buffer, where, obs, reward, rng)
+    assert np.array_equal(obs, before[0]) and np.array_equal(reward, before[1])
+    train_expert.hindsight("reacher-easy", buffer, where, obs, reward, rng)
     starts = [int(np.argmin(np.abs(walk[:, 0] - x))) for x in obs[0, 0]]
+    assert np.array_equal(starts, where[1])
     untouched = [0, 1, 2, 5, 6, 7]  # only finger-to-target ever differs from the episode
     for h in range(4):
         assert np.allclose(obs[h][untouched], walk[np.add(starts, h)].T[untouched])
@@ -66,7 +81,7 @@ def test_segments_are_in_order_and_most_get_other_targets():
 
 def play(parts, seed=4, policy=True):
     """Actions of a training episode, from the first model and then, part by part, another."""
-    episode = fac.Exploration(fac.Environment("reacher-easy"), seed, 0.1)
+    episode = train_expert.Episode(fac.Environment("reacher-easy"), seed, exploration_std=0.1)
     sizes = fac.ModelConfig(8, 3, 1, 4, 6, 6)
     for model_seed, decisions in parts:
         model = fac.WorldModel.create(sizes, np.random.default_rng(model_seed), policy=policy)
@@ -88,7 +103,7 @@ def test_exploration_adds_noise_of_its_deviation(std):
         def act(self, obs):
             return np.full(3, 0.1, np.float32)
 
-    episode = fac.Exploration(fac.Environment("reacher-easy"), 0, std)
+    episode = train_expert.Episode(fac.Environment("reacher-easy"), 0, exploration_std=std)
     episode.play(Still(), 300)
     noise = np.stack(episode.action) - np.float32(0.1)
     assert abs(noise.std() - std) <= 0.1 * std and abs(noise.mean()) <= 0.1 * std
@@ -107,8 +122,7 @@ def test_an_episode_may_get_new_weights_on_its_way():
 def trained(tmp_path_factory):
     """A finished run: (its process, its folder)."""
     folder = tmp_path_factory.mktemp("train")
-    return run("train", *TINY, "--episodes", "1", "--out", "whole", "--json", cwd=folder), \
-        folder / "whole"
+    return train("--episodes", "1", "--out", "whole", "--json", cwd=folder), folder / "whole"
 
 
 def weights(folder, kind):
@@ -123,12 +137,12 @@ def test_train_prints_json_and_writes_what_distill_takes(trained, tmp_path):
             "student_return_mean", "ratio", "lag", "out", "done"} <= set(found)
     assert (found["steps"], found["updates"]) == (3000, 30) and set(found["lag"]) == {"50", "75",
                                                                                       "90"}
-    assert set(os.listdir(folder)) - {"curve.png"} == {"curve.csv", "expert.npz", "replay.npz",
-                                                       "student.npz"}
+    assert set(os.listdir(folder)) - {"curve.png"} == {
+        "checkpoint.npz", "curve.csv", "expert.npz", "replay.npz", "student.npz"}
     with open(folder / "curve.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [int(r["decisions"]) for r in rows] == [1000, 2000, 3000]
-    assert tuple(rows[0]) == fac.TRAINING_CURVE and rows[0]["value"] == ""
+    assert tuple(rows[0]) == train_expert.CURVE and rows[0]["value"] == ""
     assert float(rows[-1]["value"]) > 0
     # every 2000 decisions, and what came out; in the row whose weights were tested
     assert [bool(r["eval_expert"] and r["eval_student"]) for r in rows] == [False, True, True]
@@ -140,37 +154,37 @@ def test_train_prints_json_and_writes_what_distill_takes(trained, tmp_path):
 
 
 def test_the_number_of_workers_changes_nothing(trained, tmp_path):
-    succeeded(run("train", *TINY, "--workers", "2", "--out", "other",
-                  cwd=tmp_path))
+    succeeded(train("--workers", "2", "--out", "other", cwd=tmp_path))
     for kind in ("expert", "student"):
         assert weights(tmp_path / "other", kind) == weights(trained[1], kind)
 
 
 def test_a_run_may_begin_without_random_episodes(tmp_path):
-    done = run("train", *TINY, "--seed-decisions", "0", "--steps", "1000", "--out", "run", "--json",
+    done = train("--seed-decisions", "0", "--steps", "1000", "--out", "run", "--json",
                cwd=tmp_path)
     assert last_json(done)["steps"] == 1000
 
 
 def test_a_killed_run_goes_on_to_the_same_result(trained, tmp_path):
     out = tmp_path / "killed"
-    stopped = run("train", *TINY, "--minutes", "1e-9", "--out", out, "--json", cwd=tmp_path)
+    stopped = train("--minutes", "1e-9", "--out", out, "--json", cwd=tmp_path)
     assert last_json(stopped)["done"] is False and "goes on" in stopped.stderr
-    process = subprocess.Popen([sys.executable, fac.__file__, "train", *TINY,
-                                "--out", out], stderr=subprocess.DEVNULL,
-                               stdout=subprocess.DEVNULL)
+    process = subprocess.Popen([sys.executable, SCRIPT, *TINY, "--out", out],
+                               stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     deadline = time.time() + 100
-    while not (out / "curve.csv").exists() and time.time() < deadline:
+    while len((out / "curve.csv").read_text().splitlines()) < 2 and time.time() < deadline:
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     process.wait()
     for _ in range(20):  # a round at a time, until something has been learned
         if fac.read_npz(out / "checkpoint.npz", ("checkpoint",))[0]["updates"]:
             break
-        last_json(run("train", *TINY, "--minutes", "1e-2", "--out", out, "--json", cwd=tmp_path))
+        last_json(train("--minutes", "1e-2", "--out", out, "--json", cwd=tmp_path))
     before = fac.read_npz(out / "checkpoint.npz", ("checkpoint",))[0]
+    with open(out / "curve.csv", newline="") as file:  # no row that a resumed run makes again
+        assert len(list(csv.DictReader(file))) <= len(before["curve"])
     assert before["updates"] > 0 and before["decisions"] < 3000
-    succeeded(run("train", *TINY, "--resume", "--out", out, cwd=tmp_path))
+    succeeded(train("--resume", "--out", out, cwd=tmp_path))
     for kind in ("expert", "student"):
         assert weights(out, kind) == weights(trained[1], kind)
 
@@ -185,7 +199,6 @@ def test_a_killed_run_goes_on_to_the_same_result(trained, tmp_path):
     (["--lr", "inf"], ["lr", "finite"]),
     (["--updates-per-step", "nan"], ["updates_per_step", "nan"]),
     (["--mlp-dim", "0"], ["mlp_dim", "at least 1"]),
-    (["--distill-horizon", "3"], ["4 actions", "hold 3"]),
     (["--num-agents", "2"], ["[1, 3]"]),
     (["--num-agents", "0"], ["[1, 3]"]),
     (["--horizon", "501"], ["horizon", "500"]),
@@ -199,32 +212,177 @@ def test_a_killed_run_goes_on_to_the_same_result(trained, tmp_path):
     (["--episodes", "-1"], ["--episodes"]),
 ])
 def test_train_refuses(tmp_path, flags, parts):
-    refused(run("train", *TINY, *flags, cwd=tmp_path), *parts)
+    refused(train(*flags, cwd=tmp_path), *parts, program="train_expert.py")
 
 
 def test_other_settings_and_broken_checkpoints_are_refused(tmp_path):
-    out = tmp_path / "run"
-    succeeded(run("train", *TINY, "--minutes", "1e-9", "--out", out, cwd=tmp_path))
-    before = (out / "checkpoint.npz").read_bytes()
-    refused(run("train", *TINY, "--out", out, "--lr", "0.01", cwd=tmp_path), "checkpoint.npz", "lr",
-            "0.01")
-    assert (out / "checkpoint.npz").read_bytes() == before
-    (out / "checkpoint.npz").write_bytes(before[:1000])
-    refused(run("train", *TINY, "--out", out, cwd=tmp_path), "checkpoint.npz", "not a readable")
+    out, checkpoint = tmp_path / "run", tmp_path / "run" / "checkpoint.npz"
+
+    def refuses(*parts, flags=()):
+        refused(train("--out", out, *flags, cwd=tmp_path), *parts, program="train_expert.py")
+
+    succeeded(train("--minutes", "1e-9", "--out", out, cwd=tmp_path))
+    before = checkpoint.read_bytes()
+    refuses("checkpoint.npz", "lr", "0.01", flags=("--lr", "0.01"))
+    assert checkpoint.read_bytes() == before
+    checkpoint.write_bytes(before[:1000])
+    refuses("checkpoint.npz", "not a readable")
     for key in ("slow", "student adam_v"):
-        (out / "checkpoint.npz").write_bytes(before)
-        header, arrays = fac.read_npz(out / "checkpoint.npz", ("checkpoint",))
+        checkpoint.write_bytes(before)
+        header, arrays = fac.read_npz(checkpoint, ("checkpoint",))
         del arrays[key]
-        fac.write_npz(out / "checkpoint.npz", header, arrays)
-        refused(run("train", *TINY, "--out", out, cwd=tmp_path), "checkpoint.npz", key)
+        fac.write_npz(checkpoint, header, arrays)
+        refuses("checkpoint.npz", key)
 
 
 def test_the_lag_is_counted_from_the_expert_s_crossing():
     def row(decisions, expert, student):
-        return [decisions] + [None] * (len(fac.TRAINING_CURVE) - 3) + [expert, student]
+        return {"decisions": decisions, "eval_expert": expert, "eval_student": student}
 
     curve = [row(1000, None, None), row(2000, 400.0, 0.0), row(4000, 800.0, 500.0),
              row(6000, 1000.0, 700.0)]
-    assert fac.lag(curve, 0.4) == 2000 and fac.lag(curve, 0.7) == 2000
-    assert fac.lag(curve, 0.9) is None and fac.lag(curve[:1], 0.5) is None
-    assert json.dumps(fac.lag([row(2000, 0.0, 0.0)], 0.5)) == "null"
+    lag = train_expert.lag
+    assert lag(curve, 0.4) == 2000 and lag(curve, 0.7) == 2000
+    assert lag(curve, 0.9) is None and lag(curve[:1], 0.5) is None
+    assert json.dumps(lag([row(2000, 0.0, 0.0)], 0.5)) == "null"
+
+
+# the two learners, and acting for them ------------------------------------------------
+
+SMALL = [*TINY[:TINY.index("--student")], "--workers", "1", "--episodes", "0"]
+
+
+def trained_here(capsys, *arguments):
+    """The result of a small run in this process, where PyTorch is imported once."""
+    assert train_expert.main([*SMALL, *map(str, arguments), "--json"]) == 0
+    return json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+def weights_of(folder):
+    model, header = fac.load_model(folder / "expert.npz")
+    return np.concatenate([v.ravel() for v in model.params.values()]), header
+
+
+def test_both_learners_learn_the_same_from_the_same_episodes(tmp_path, capsys):
+    """Random episodes, since one rounded bit may turn a plan; then ten updates."""
+    pytest.importorskip("torch")
+    for backend in ("numpy", "torch"):
+        trained_here(capsys, "--backend", backend, "--steps", 1000, "--student", "fac",
+                     "--out", tmp_path / backend)
+    (ours, header), (theirs, other) = (weights_of(tmp_path / b) for b in ("numpy", "torch"))
+    assert (header["backend"], header["updates"]) == ("numpy", 10)
+    assert (other["backend"], other["updates"], other["precision"]) == ("torch", 10, "float32")
+    fresh = fac.WorldModel.create(fac.ModelConfig(8, 3, 1, 6, 8, 16), fac.stream(0, "expert"), True)
+    fresh = np.concatenate([v.ravel() for v in fresh.params.values()])
+    assert np.abs(theirs - fresh).max() > 4e-3  # Adam's ten steps, 5e-4 each
+    assert np.linalg.norm(ours - theirs) < 1e-3 * np.linalg.norm(theirs - fresh)
+
+
+def test_train_expert_in_stretches(tmp_path, capsys):
+    """Both learners go on with another planner, but not with another learning rate."""
+    pytest.importorskip("torch")
+    out = tmp_path / "run"
+
+    def train(steps, *more):
+        return train_expert.main([*SMALL, "--task", "walker-walk", "--envs", "1", "--backend",
+                                  "torch", "--plan-pi-trajs", "2", "--seed-decisions", "500",
+                                  "--steps", str(steps), "--out", str(out), *more])
+
+    assert train(499) == 2 and "499" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+    assert train(500, "--updates-per-step", "0.1") == 0
+    assert train(1000, "--plan-horizon", "0", "--updates-per-step", "0.2") == 0
+    assert len((out / "curve.csv").read_text().splitlines()) == 3
+    expert, header = fac.load_model(out / "expert.npz")
+    assert expert.has_policy and (header["decisions"], header["updates"]) == (1000, 150)
+    assert header["training_planner"]["horizon"] == 0
+    assert fac.Replay(out / "replay.npz").transitions == 1000
+    assert train(1500, "--lr", "1e-3") == 2
+    message = capsys.readouterr().err.splitlines()[-1]
+    for part in ("checkpoint.npz", "lr: expected 0.001, found 0.0005", "--out"):
+        assert part in message
+    assert train(1500, "--backend", "numpy") == 2
+    assert train(1500, "--device", "nonsense") == 2
+    assert "--device nonsense" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_run_in_pytorch_goes_on_to_the_same_result(tmp_path, capsys):
+    pytest.importorskip("torch")
+    arguments = ["--backend", "torch", "--steps", 2000]
+    trained_here(capsys, *arguments, "--out", tmp_path / "whole")
+    for _ in range(20):
+        found = trained_here(capsys, *arguments, "--minutes", 1e-4, "--out", tmp_path / "parts")
+        if found["done"]:
+            break
+        header, arrays = fac.read_npz(tmp_path / "parts" / "checkpoint.npz", ("checkpoint",))
+    assert header["updates"] > 0 and "exp_avg _encoder.0.weight" in arrays
+    whole, parts = (weights_of(tmp_path / name)[0] for name in ("whole", "parts"))
+    assert np.array_equal(whole, parts)
+
+
+def test_numpy_s_learner_needs_no_pytorch(tmp_path):
+    code = "import sys; sys.modules['torch'] = None; import train_expert; " \
+           "sys.exit(train_expert.main(sys.argv[1:]))"
+    env = {**ONE_THREAD, "PYTHONPATH": os.pathsep.join([str(SCRIPT.parent), str(ROOT)])}
+    run = ["-c", code, *SMALL, "--minutes", "1e-9"]
+    succeeded(launch(run, tmp_path, env))
+    refused(launch([*run, "--backend", "torch"], tmp_path, env), "pip install torch",
+            program="train_expert.py")
+
+
+def test_help_is_quick_and_starts_nothing(tmp_path):
+    code = WATCHED.replace("import fac_tdmpc_ref as fac", "import train_expert as fac")
+    env = {**ONE_THREAD, "PYTHONPATH": str(SCRIPT.parent)}
+    done = succeeded(launch(["-c", code, "--help"], tmp_path, env))
+    text = re.sub(r"\s+", " ", done.stdout)
+    assert text.startswith("usage: train_expert.py") and done.stderr == ""
+    for part in ("--student", "--plan-samples", "(Table 2) [128; paper: 512]",
+                 "(Table 2) [256; paper: 512]", "--backend"):
+        assert part in text
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_actors_equal_single_environments(workers):
+    """Random episodes, a part at a time, in processes: what their actions lead to here."""
+    task, seeds = "reacher-easy", [3, 4, 5]
+    actors = train_expert.Actors(task, workers)
+    try:
+        actors.begin([(seed, "explorer", 0.5) for seed in seeds])
+        for decisions in (1, 2):
+            actors.play(decisions, {})
+            episodes = actors.wait()
+    finally:
+        actors.close()
+    environment = fac.Environment(task)
+    for seed, (obs, action, reward) in zip(seeds, episodes, strict=True):
+        assert obs.dtype == action.dtype == reward.dtype == np.float32
+        np.testing.assert_array_equal(obs[0], environment.reset(seed))
+        for t in range(3):
+            after, earned = environment.step(action[t])
+            np.testing.assert_array_equal(obs[t + 1], after)
+            assert reward[t] == np.float32(earned)
+
+
+def test_tests_beside_the_training_are_an_evaluation():
+    """A named player keeps its planner and explores nothing: the returns that evaluate gives."""
+    model = fac.WorldModel.create(fac.ModelConfig(8, 3, 1, 4, 6, 6), np.random.default_rng(0))
+    for key in ("_Q1.5.weight", "_Q2.5.weight"):
+        model.params[key] += 1
+    planning, seeds = fac.PlannerConfig(samples=8, iterations=1), fac.episode_seeds(0, 2)
+    actors = train_expert.Actors("reacher-easy", 1)
+    try:
+        actors.begin([(7, "explorer", 0.5), *((seed, "expert") for seed in seeds)])
+        actors.play(200, {"expert": (model, planning)})
+        actors.wait()
+        actors.play(300, {"explorer": (model, planning)})
+        returns = [reward.sum() for *_, reward in actors.wait()[1:]]
+    finally:
+        actors.close()
+    assert returns == fac.evaluate(model, "reacher-easy", planning, 2, 0, 0)["returns"]
+
+
+def test_a_bad_rendering_setting_is_explained(tmp_path):
+    done = launch([SCRIPT, *SMALL], tmp_path, {**ONE_THREAD, "MUJOCO_GL": "nonsense"})
+    assert done.returncode == 2 and "Traceback" not in done.stderr, done.stderr
+    assert "MUJOCO_GL" in done.stderr.splitlines()[-1] and "'nonsense'" in done.stderr
