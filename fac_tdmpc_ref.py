@@ -3,10 +3,10 @@
 A TD-MPC expert (encoder, dynamics, reward, value; planning by MPPI in latent space) is distilled
 into a student whose latent state, dynamics, reward and value fall apart into one small model for
 each action dimension. Each joint then plans alone: cheaper, and in parallel. What that keeps of
-the return is measured, in the README. This file holds the method whole: networks with
-hand-written gradients, Adam, TD-MPC's Equation 1, Algorithm 1 (Equation 4), MPPI (Equations 2 and
-3), planning workers, environments, and the command line. data/train_expert.py trains experts with
-Equation 1, as it is here or in PyTorch, which the golden tests compare with.
+the return is measured, in the README. This file holds the method: networks with hand-written
+gradients, Adam, TD-MPC's Equation 1, Algorithm 1 (Equation 4), MPPI (Equations 2 and 3), planning
+workers, environments, files and two commands. What uses the method is in data/: training experts,
+the paper's experiments, checkpoints from elsewhere.
 
     python fac_tdmpc_ref.py distill --task reacher-hard
     python fac_tdmpc_ref.py evaluate --model runs/reacher-hard-0/student.npz
@@ -20,15 +20,16 @@ the case N = 1. There is one world model, one planner, one loss. The axes, every
     O   observation features;   A = N * d   action dimensions
     B   batch;   S   action sequences (both always the last axis)
     K   noise samples of the distillation loss (behind B)
-    H   horizon;   L   steps of a sequence (H + 1 in Equations 2 and 4)
+    H   horizon: H rewards, then Q;   L   actions of a sequence: H + 1 in Equations 2 and 4
 
 A layer is W (N, out, in), b (N, out, 1) and computes W @ x + b on x (N, in, B): samples last, so
 that activations run over long contiguous rows, and a torch Linear.weight goes in as weight[None].
 Rewards and values come out as (N, B), agent i's share; the global one is their sum over N.
 
 Read it from top to bottom: 1 configuration, 2 layers, 3 world model, 4 Equation 1,
-5 distillation, 6 planning, 7 environments, 8 data, 9 experiments and command line. Departures
-from the paper are tagged [D1], [D2], ...; the README lists them with what each bought.
+5 distillation, 6 planning, 7 environments, 8 files, 9 commands. A first reading may skip what is
+marked "the same, fast" and "the same, in processes" in section 6. Departures from the paper are
+tagged [D1], [D2], ...; the README lists them with what each bought.
 """
 from __future__ import annotations
 
@@ -319,11 +320,11 @@ class Arena:
         """An array of this shape and dtype with arbitrary contents."""
         if self._next == len(self._arrays):
             self._arrays.append(None)
-        kept = self._arrays[self._next]
-        if kept is None or kept.shape != shape or kept.dtype != dtype:
-            kept = self._arrays[self._next] = np.empty(shape, dtype)
+        array = self._arrays[self._next]
+        if array is None or array.shape != shape or array.dtype != dtype:
+            array = self._arrays[self._next] = np.empty(shape, dtype)
         self._next += 1
-        return kept
+        return array
 
 
 # Every function takes `empty`: where its outputs live, np.empty or an Arena's.
@@ -765,10 +766,10 @@ def policy_loss(model, rollout, noise, lam, grads, empty=np.empty):
     q1, q2 = (forward(QNET, model.params, name, x, q_tape, empty)
               for name, q_tape in zip(("_Q1", "_Q2"), q_tapes))
     weights = np.repeat(lam ** np.arange(steps) / batch, batch).astype(x.dtype)
-    share = np.where(q1 == q2, F32(0.5), q1 < q2).astype(x.dtype)  # a tie counts half for each
+    first = np.where(q1 == q2, F32(0.5), q1 < q2).astype(x.dtype)  # a tie counts half for each
     da = 0
-    for name, q_tape, s in (("_Q1", q_tapes[0], share), ("_Q2", q_tapes[1], 1 - share)):
-        dx = backward(QNET, model.params, name, q_tape, -weights * s, None, empty)
+    for name, q_tape, smaller in (("_Q1", q_tapes[0], first), ("_Q2", q_tapes[1], 1 - first)):
+        dx = backward(QNET, model.params, name, q_tape, -weights * smaller, None, empty)
         da = da + dx[:, rollout.shape[1]:]
     backward(MLP, model.params, "_pi", tape, tanh_backward(da, mu), grads, empty)
     return -float((weights * np.minimum(q1, q2)).sum())
@@ -898,6 +899,23 @@ def learning_rate(config, t):
     return float(rate)
 
 
+def perturbed_batch(expert, student, obs, actions, config, rng, empty=np.empty):
+    """Features (1, F, B), perturbed actions (L, A, B, K) and the expert's predictions for them.
+
+    obs (O, B) and actions (L, A, B) come from the replay. Each state has a deviation of its own
+    for eps_h, and a_h + eps_h is clipped [D8].
+    """
+    noise = rng.standard_normal((*actions.shape, config.noise_samples), F32)
+    span = np.log([config.noise_std_min, config.noise_std])
+    noise *= np.exp(rng.uniform(*span, actions.shape[-1])).astype(F32)[:, None]
+    perturbed = np.add(noise, actions[..., None], out=noise)
+    if config.clip_actions:
+        np.clip(perturbed, -1, 1, out=perturbed)
+    z = expert.encode(obs)
+    features = z.reshape(1, -1, z.shape[-1]) if student.config.expert_latent_dim else obs[None]
+    return features, perturbed, predict(expert, z, perturbed, empty=empty)
+
+
 POOL = 4096  # states whose predictions by the expert are computed in one go
 
 
@@ -941,7 +959,7 @@ class Distiller:
             obs, actions = self.replay.sequences(starts, self.config.horizon + 1)
             if reacher:  # [D7]
                 chosen = rng.random(size) < self.config.new_targets
-                obs[3:5, chosen] = new_targets(obs[:, chosen], rng)
+                obs[3:5, chosen] = draw_targets(obs[:, chosen], rng)
             parts.append(perturbed_batch(self.expert, self.student, obs, actions, self.config, rng))
         features, actions, targets = zip(*parts)
         return (np.concatenate(features, 2), np.concatenate(actions, 2),
@@ -978,12 +996,23 @@ class Distiller:
         total = np.zeros(3)
         for part, learner, losses in zip(parts, self._learners,
                                          self._threads.map(learn, self._learners, parts)):
-            share, gradient = len(part) / self.config.batch_size, learner[1]
-            total += share * np.array(losses)
-            self.optimizer.gradient += gradient.dtype.type(share) * gradient
+            fraction, gradient = len(part) / self.config.batch_size, learner[1]
+            total += fraction * np.array(losses)
+            self.optimizer.gradient += gradient.dtype.type(fraction) * gradient
             gradient[:] = 0
         self.optimizer.step(learning_rate(self.config, self.t), self.config.grad_clip)
         return tuple(total.tolist())
+
+    def run(self, play=None):
+        """Algorithm 1 from here to its end; yields the losses of each step.
+
+        play: takes the number of episodes that the student is to play, and returns them as `add`
+        takes them; not needed without own episodes [D9].
+        """
+        while self.t < self.config.steps:
+            if self.episodes_due:
+                self.add(*play(self.episodes_due))
+            yield self.step()
 
     @property
     def t(self):
@@ -1025,23 +1054,6 @@ class Distiller:
         """Stop the threads and give BLAS its own back."""
         self._threads.shutdown(wait=True, cancel_futures=True)
         self._blas.restore_original_limits()
-
-
-def perturbed_batch(expert, student, obs, actions, config, rng, empty=np.empty):
-    """Features (1, F, B), perturbed actions (L, A, B, K) and the expert's predictions for them.
-
-    obs (O, B) and actions (L, A, B) come from the replay. Each state has a deviation of its own
-    for eps_h, and a_h + eps_h is clipped [D8].
-    """
-    noise = rng.standard_normal((*actions.shape, config.noise_samples), F32)
-    span = np.log([config.noise_std_min, config.noise_std])
-    noise *= np.exp(rng.uniform(*span, actions.shape[-1])).astype(F32)[:, None]
-    noise += actions[..., None]
-    if config.clip_actions:
-        np.clip(noise, -1, 1, out=noise)
-    z = expert.encode(obs)
-    features = z.reshape(1, -1, z.shape[-1]) if student.config.expert_latent_dim else obs[None]
-    return features, noise, predict(expert, z, noise, empty=empty)
 
 
 def horizon_returns(rewards, q1, q2, discount):
@@ -1100,6 +1112,185 @@ def h_step_return(model, z, actions, config):
         z = model.next(z, actions[:, h])
     q1, q2 = model.q(z, actions[:, config.horizon])
     return G + gamma ** config.horizon * (q1 + q2) / 2
+
+
+def mppi(returns, mean, config, rngs, proposals=None):
+    """MPPI: refine a Gaussian over action sequences by its elites, for each agent alone.
+
+    returns: (N, L, d, S) actions -> (N, S); mean (N, L, d): the proposal to start from; rngs:
+    one Generator for each agent; proposals (N, L, d, P): sequences that compete in every
+    iteration. Elites are chosen agent by agent, which Proposition 1 allows: with N = 1 this is
+    centralized MPPI. Returns the new mean (N, L, d), the last elites (N, L, d, E) and their
+    scores (N, E), which sum to 1.
+    """
+    mean, std = mean[..., None], F32(config.max_std)
+    if proposals is not None:
+        G_proposals = returns(proposals)
+    for _ in range(config.iterations):
+        actions = np.stack([rng.standard_normal((*mean.shape[1:3], config.samples), F32)
+                            for rng in rngs])
+        actions *= std
+        actions += mean
+        np.clip(actions, -1, 1, out=actions)
+        G = returns(actions)
+        if proposals is not None:
+            actions = np.concatenate([actions, proposals], -1)
+            G = np.concatenate([G, G_proposals], 1)
+        G = np.where(np.isfinite(G), G, F32(-np.inf))  # these weigh nothing
+        if np.isneginf(G.max(1)).any():
+            raise UserError("planning: no action sequence has a finite return; the model's weights "
+                            "or the observation are far out of range")
+        best = np.argpartition(-G, config.num_elites - 1, axis=1)[:, :config.num_elites]
+        elites = np.take_along_axis(actions, best[:, None, None], 3)
+        G = np.take_along_axis(G, best, 1)
+        scores = np.exp(config.inverse_temperature * (G - G.max(1, keepdims=True)))
+        scores /= scores.sum(1, keepdims=True)
+        p = scores[:, None, None]
+        new = (p * elites).sum(3, keepdims=True)
+        std = np.sqrt((p * (elites - new) ** 2).sum(3, keepdims=True))
+        std = np.clip(std, config.min_std, config.max_std)
+        mean = config.momentum * mean + (1 - config.momentum) * new
+    return mean[..., 0], elites, scores
+
+
+class AgentPlanner:
+    """Plans for the agents of one model: the same for all of them, for a part, for N = 1."""
+
+    def __init__(self, model, config):
+        self.model, self.config = model, config
+        self.returns = Returns(model) if config.returns == "fast" else None
+        self.reset([])
+
+    def reset(self, seeds):
+        """Forget the warm start; seeds: one SeedSequence for each agent, [] to keep streams."""
+        sizes = self.model.config
+        self.t, self.mean = 0, np.zeros((sizes.num_agents, self.config.horizon + 1,
+                                         sizes.agent_actions), F32)
+        if len(seeds):
+            self.rngs = [np.random.Generator(np.random.SFC64(s)) for s in seeds]
+
+    def plan(self, z):
+        """z (N, m, 1) -> the agents' first actions (N, d); keeps the warm start."""
+        config = self.config
+        if self.t % 200 < config.q_alone:  # [D5]
+            config = dataclasses.replace(config, horizon=0)
+        self.t += 1
+        returns = (self.returns.start(z, config) if self.returns else
+                   functools.partial(h_step_return, self.model, z, config=config))
+        start = np.ascontiguousarray(self.mean[:, :config.horizon + 1])
+        mean, elites, scores = mppi(returns, start, config, self.rngs, self._proposals(z, config))
+        self.mean[:] = 0
+        self.mean[:, :config.horizon] = mean[:, 1:]
+        if config.output == "mean":
+            return mean[:, 0]
+        pick = [min(np.searchsorted(np.cumsum(p), rng.random(), "right"), len(p) - 1)
+                for p, rng in zip(scores, self.rngs)]
+        return np.stack([e[0, :, i] for e, i in zip(elites, pick)])
+
+    def _proposals(self, z, config):
+        """Noisy policy rollouts (1, L, A, P), where there is a policy (TD-MPC's code)."""
+        if not (self.model.has_policy and config.pi_trajs):
+            return None
+        z, actions = np.repeat(z, config.pi_trajs, 2), []
+        for h in range(config.horizon + 1):
+            mu = self.model.policy(z)
+            actions.append(np.clip(mu + policy_noise(mu.shape, self.rngs[0]), -1, 1))
+            if h < config.horizon:
+                z = self.model.next(z, actions[-1])
+        return np.stack(actions, 1)
+
+
+class Planner:
+    """Observation in, action out, with the warm start kept between decisions.
+
+        with Planner(model, PlannerConfig(), seed=0, workers=1) as planner:
+            action = planner.act(obs)      # (O,) -> (A,) in [-1, 1]
+
+    workers: processes beside this one; each plans for a part of the agents (0: all here).
+    Every agent owns its random stream and one BLAS thread computes each product, so the plan
+    is the same, bit for bit, for every number of workers. Raises WorkerError when a worker
+    has died.
+    """
+
+    def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
+        sizes = model.config
+        self.model, n = model, sizes.num_agents
+        self._parts = split_agents(n, workers)
+        self._own = AgentPlanner(model.agents(0, self._parts[0].stop), config)
+        self._workers = self._z = self._actions = None
+        if len(self._parts) > 1:
+            context = multiprocessing.get_context("spawn")
+            # anonymous to the file system: nothing can be left behind, even after SIGKILL
+            raw = [context.RawArray("f", size) for size in (n * sizes.latent_dim, sizes.dim_action)]
+            self._z, self._actions = self._views(*raw, sizes)
+            self._workers = Workers(_planning_worker, len(self._parts) - 1, "planning worker",
+                                    (*raw, sizes))
+            for i, s in enumerate(self._parts[1:]):
+                self._workers.send(i, (model.agents(s.start, s.stop), config, s))
+        self.reset(np.random.SeedSequence(seed).entropy)  # None: the system's own
+
+    @staticmethod
+    def _views(raw_z, raw_actions, sizes):
+        """The shared latents (N, m, 1) and actions (N, d) as arrays."""
+        n = sizes.num_agents
+        return (np.frombuffer(raw_z, F32).reshape(n, sizes.latent_dim, 1),
+                np.frombuffer(raw_actions, F32).reshape(n, sizes.agent_actions))
+
+    def reset(self, seed=None):
+        """Start an episode: forget the warm start; a seed also starts the random streams anew."""
+        n = self.model.config.num_agents
+        seeds = [] if seed is None else np.random.SeedSequence(seed).spawn(n)
+        for i, part in enumerate(self._parts[1:]):
+            self._workers.send(i, seeds[part])
+        self._own.reset(seeds[self._parts[0]])
+
+    @property
+    def warm_start(self):
+        """What an episode hands to its next decision, where all is planned in this process."""
+        return self._own.mean, self._own.rngs, self._own.t
+
+    @warm_start.setter
+    def warm_start(self, state):
+        self._own.mean, self._own.rngs, self._own.t = state
+
+    def act(self, obs):
+        """obs (O,), anything that converts to float32 -> action (A,) float32 in [-1, 1]."""
+        obs = np.asarray(obs, F32)
+        if obs.shape != (self.model.config.dim_obs,):
+            raise UserError(f"observation: expected shape ({self.model.config.dim_obs},), "
+                            f"found {obs.shape}")
+        if not np.isfinite(obs).all():
+            raise UserError("observation: holds values that are not finite")
+        with one_thread():
+            z = self.model.encode(obs[:, None])
+            if not self._workers:
+                return self._own.plan(z).reshape(-1)
+            self._z[:] = z
+            self._workers.send_all("plan")
+            self._actions[self._parts[0]] = self._own.plan(np.ascontiguousarray(
+                z[self._parts[0]]))
+            self._workers.receive_all()
+            return self._actions.reshape(-1).copy()
+
+    def hand_over(self):
+        """Wake all workers and wait for their answers, without planning: what `act` pays."""
+        if self._workers:
+            self._workers.send_all("hello")
+            self._workers.receive_all()
+
+    def close(self):
+        """End the worker processes."""
+        if self._workers:
+            self._workers.close()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+
+# ---- The same, fast: a first reading skips this. `Returns` computes h_step_return.
 
 
 def homogeneous(params, layer):
@@ -1232,183 +1423,10 @@ def _elu(y, work):
     np.maximum(y, work, out=y)
 
 
-def mppi(returns, mean, config, rngs, proposals=None):
-    """MPPI: refine a Gaussian over action sequences by its elites, for each agent alone.
-
-    returns: (N, L, d, S) actions -> (N, S); mean (N, L, d): the proposal to start from; rngs:
-    one Generator for each agent; proposals (N, L, d, P): sequences that compete in every
-    iteration. Elites are chosen agent by agent, which Proposition 1 allows: with N = 1 this is
-    centralized MPPI. Returns the new mean (N, L, d), the last elites (N, L, d, E) and their
-    scores (N, E), which sum to 1.
-    """
-    mean, std = mean[..., None], F32(config.max_std)
-    if proposals is not None:
-        G_proposals = returns(proposals)
-    for _ in range(config.iterations):
-        actions = np.stack([rng.standard_normal((*mean.shape[1:3], config.samples), F32)
-                            for rng in rngs])
-        actions *= std
-        actions += mean
-        np.clip(actions, -1, 1, out=actions)
-        G = returns(actions)
-        if proposals is not None:
-            actions = np.concatenate([actions, proposals], -1)
-            G = np.concatenate([G, G_proposals], 1)
-        G = np.where(np.isfinite(G), G, F32(-np.inf))  # these weigh nothing
-        if np.isneginf(G.max(1)).any():
-            raise UserError("planning: no action sequence has a finite return; the model's weights "
-                            "or the observation are far out of range")
-        best = np.argpartition(-G, config.num_elites - 1, axis=1)[:, :config.num_elites]
-        elites = np.take_along_axis(actions, best[:, None, None], 3)
-        G = np.take_along_axis(G, best, 1)
-        scores = np.exp(config.inverse_temperature * (G - G.max(1, keepdims=True)))
-        scores /= scores.sum(1, keepdims=True)
-        p = scores[:, None, None]
-        new = (p * elites).sum(3, keepdims=True)
-        std = np.sqrt((p * (elites - new) ** 2).sum(3, keepdims=True))
-        std = np.clip(std, config.min_std, config.max_std)
-        mean = config.momentum * mean + (1 - config.momentum) * new
-    return mean[..., 0], elites, scores
+# ---- The same, in processes: workers plan for a part of the agents each.
 
 
-class AgentPlanner:
-    """Plans for the agents of one model: the same for all of them, for a share, for N = 1."""
-
-    def __init__(self, model, config):
-        self.model, self.config = model, config
-        self.returns = Returns(model) if config.returns == "fast" else None
-        self.reset([])
-
-    def reset(self, seeds):
-        """Forget the warm start; seeds: one SeedSequence for each agent, [] to keep streams."""
-        sizes = self.model.config
-        self.t, self.mean = 0, np.zeros((sizes.num_agents, self.config.horizon + 1,
-                                         sizes.agent_actions), F32)
-        if len(seeds):
-            self.rngs = [np.random.Generator(np.random.SFC64(s)) for s in seeds]
-
-    def plan(self, z):
-        """z (N, m, 1) -> the agents' first actions (N, d); keeps the warm start."""
-        config = self.config
-        if self.t % 200 < config.q_alone:  # [D5]
-            config = dataclasses.replace(config, horizon=0)
-        self.t += 1
-        returns = (self.returns.start(z, config) if self.returns else
-                   functools.partial(h_step_return, self.model, z, config=config))
-        start = np.ascontiguousarray(self.mean[:, :config.horizon + 1])
-        mean, elites, scores = mppi(returns, start, config, self.rngs, self._proposals(z, config))
-        self.mean[:] = 0
-        self.mean[:, :config.horizon] = mean[:, 1:]
-        if config.output == "mean":
-            return mean[:, 0]
-        pick = [min(np.searchsorted(np.cumsum(p), rng.random(), "right"), len(p) - 1)
-                for p, rng in zip(scores, self.rngs)]
-        return np.stack([e[0, :, i] for e, i in zip(elites, pick)])
-
-    def _proposals(self, z, config):
-        """Noisy policy rollouts (1, L, A, P), where there is a policy (TD-MPC's code)."""
-        if not (self.model.has_policy and config.pi_trajs):
-            return None
-        z, actions = np.repeat(z, config.pi_trajs, 2), []
-        for h in range(config.horizon + 1):
-            mu = self.model.policy(z)
-            actions.append(np.clip(mu + policy_noise(mu.shape, self.rngs[0]), -1, 1))
-            if h < config.horizon:
-                z = self.model.next(z, actions[-1])
-        return np.stack(actions, 1)
-
-
-class Planner:
-    """Observation in, action out, with the warm start kept between decisions.
-
-        with Planner(model, PlannerConfig(), seed=0, workers=1) as planner:
-            action = planner.act(obs)      # (O,) -> (A,) in [-1, 1]
-
-    workers: processes beside this one; each plans for its share of the agents (0: all here).
-    Every agent owns its random stream and one BLAS thread computes each product, so the plan
-    is the same, bit for bit, for every number of workers. Raises WorkerError when a worker
-    has died.
-    """
-
-    def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
-        sizes = model.config
-        self.model, n = model, sizes.num_agents
-        self._shares = shares(n, workers)
-        self._own = AgentPlanner(model.agents(0, self._shares[0].stop), config)
-        self._workers = self._z = self._actions = None
-        if len(self._shares) > 1:
-            context = multiprocessing.get_context("spawn")
-            # anonymous to the file system: nothing can be left behind, even after SIGKILL
-            raw = [context.RawArray("f", size) for size in (n * sizes.latent_dim, sizes.dim_action)]
-            self._z, self._actions = self._views(*raw, sizes)
-            self._workers = Workers(_planning_worker, len(self._shares) - 1, "planning worker",
-                                    (*raw, sizes))
-            for i, s in enumerate(self._shares[1:]):
-                self._workers.send(i, (model.agents(s.start, s.stop), config, s))
-        self.reset(np.random.SeedSequence(seed).entropy)  # None: the system's own
-
-    @staticmethod
-    def _views(raw_z, raw_actions, sizes):
-        """The shared latents (N, m, 1) and actions (N, d) as arrays."""
-        n = sizes.num_agents
-        return (np.frombuffer(raw_z, F32).reshape(n, sizes.latent_dim, 1),
-                np.frombuffer(raw_actions, F32).reshape(n, sizes.agent_actions))
-
-    def reset(self, seed=None):
-        """Start an episode: forget the warm start; a seed also starts the random streams anew."""
-        n = self.model.config.num_agents
-        seeds = [] if seed is None else np.random.SeedSequence(seed).spawn(n)
-        for i, share in enumerate(self._shares[1:]):
-            self._workers.send(i, seeds[share])
-        self._own.reset(seeds[self._shares[0]])
-
-    @property
-    def warm_start(self):
-        """What an episode hands to its next decision, where all is planned in this process."""
-        return self._own.mean, self._own.rngs, self._own.t
-
-    @warm_start.setter
-    def warm_start(self, state):
-        self._own.mean, self._own.rngs, self._own.t = state
-
-    def act(self, obs):
-        """obs (O,), anything that converts to float32 -> action (A,) float32 in [-1, 1]."""
-        obs = np.asarray(obs, F32)
-        if obs.shape != (self.model.config.dim_obs,):
-            raise UserError(f"observation: expected shape ({self.model.config.dim_obs},), "
-                            f"found {obs.shape}")
-        if not np.isfinite(obs).all():
-            raise UserError("observation: holds values that are not finite")
-        with one_thread():
-            z = self.model.encode(obs[:, None])
-            if not self._workers:
-                return self._own.plan(z).reshape(-1)
-            self._z[:] = z
-            self._workers.send_all("plan")
-            self._actions[self._shares[0]] = self._own.plan(np.ascontiguousarray(
-                z[self._shares[0]]))
-            self._workers.receive_all()
-            return self._actions.reshape(-1).copy()
-
-    def hand_over(self):
-        """Wake all workers and wait for their answers, without planning: what `act` pays."""
-        if self._workers:
-            self._workers.send_all("hello")
-            self._workers.receive_all()
-
-    def close(self):
-        """End the worker processes."""
-        if self._workers:
-            self._workers.close()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.close()
-
-
-def shares(agents, workers):
+def split_agents(agents, workers):
     """Agents of this process and of each worker beside it, as slices; UserError for too many."""
     if not 0 <= workers < agents:
         raise UserError(f"{workers} workers are no use to {agents} agents, one of which is left "
@@ -1430,14 +1448,14 @@ def useful_workers(agents):
 
 
 def _planning_worker(connection, raw_z, raw_actions, sizes):
-    """Plans for its share of the agents when told to "plan"; a list is new random streams."""
+    """Plans for its part of the agents when told to "plan"; a list is new random streams."""
     z, actions = Planner._views(raw_z, raw_actions, sizes)
-    model, config, share = connection.recv()
+    model, config, part = connection.recv()
     planner, done = AgentPlanner(model, config), pickle.dumps(None)
     while True:
         message = connection.recv()
         if message == "plan":
-            actions[share] = planner.plan(z[share].copy())
+            actions[part] = planner.plan(z[part].copy())
         if isinstance(message, str):
             connection.send_bytes(done)
         else:
@@ -1711,7 +1729,7 @@ def move_target(obs, reward, back, chosen, task):
     reward[:, chosen] = ACTION_REPEAT * (distance <= radius)
 
 
-def new_targets(obs, rng):
+def draw_targets(obs, rng):
     """Finger-to-target (2, B) of reacher states (8, B) for targets drawn as the task draws them."""
     heading = np.cumsum(obs[:3], 0)
     finger = REACHER_LINK * np.stack([np.cos(heading).sum(0), np.sin(heading).sum(0)])
@@ -1720,7 +1738,7 @@ def new_targets(obs, rng):
 
 
 # ======================================================================================
-# 8. Data: weights, replay, files
+# 8. Files: weights, replay, replay buffer
 # ======================================================================================
 
 DATA = Path(__file__).resolve().parent / "data"
@@ -1874,13 +1892,13 @@ class Replay:
         Every (1 / held_out)-th episode is held out, so that all of the expert's training counts.
         """
         every = max(2, round(1 / held_out))
-        kept, held = [], []
+        training, held = [], []
         for i, (begin, end) in enumerate(zip(np.r_[0, self.ends + 1], self.ends)):
-            (held if i % every == every - 1 else kept).append(np.arange(begin, end - steps + 1))
-        if not held or not sum(map(len, kept)) or not sum(map(len, held)):
+            (held if i % every == every - 1 else training).append(np.arange(begin, end - steps + 1))
+        if not held or not sum(map(len, training)) or not sum(map(len, held)):
             raise UserError(f"{self.path}: {len(self.ends)} episodes are too few to hold out a "
                             f"share of {held_out} and sample {steps} steps; collect more")
-        return np.concatenate(kept), np.concatenate(held)
+        return np.concatenate(training), np.concatenate(held)
 
     def sequences(self, starts, steps):
         """First observations (O, B) and actions (L, A, B), float32, of the rows in `starts`."""
@@ -1914,14 +1932,14 @@ class ReplayBuffer:
 
     def state(self):
         """The episodes held, as arrays; `load` takes them back."""
-        kept = len(self)
-        return {"observation": self.observation[:kept], "action": self.action[:kept],
-                "reward": self.reward[:kept], "count": np.int64(self.count)}
+        n = len(self)
+        return {"observation": self.observation[:n], "action": self.action[:n],
+                "reward": self.reward[:n], "count": np.int64(self.count)}
 
     def load(self, state):
         """Hold what a `state` holds."""
-        kept, self.count = len(state["reward"]), int(state["count"])
-        self.observation[:kept], self.action[:kept], self.reward[:kept] = (
+        n, self.count = len(state["reward"]), int(state["count"])
+        self.observation[:n], self.action[:n], self.reward[:n] = (
             state[k] for k in ("observation", "action", "reward"))
 
     def sample(self, rng, batch, steps):
@@ -1968,7 +1986,7 @@ def data_file(task, name):
 
 
 # ======================================================================================
-# 9. Experiments and command line
+# 9. Commands
 # ======================================================================================
 
 
@@ -2108,9 +2126,8 @@ def check_finite(values, update, lr):
                             f"diverged; lower the learning rate ({lr})")
 
 
-def own_episodes(distiller, task, playing, workers):
-    """The next episodes that the student plays, as `Distiller.add` takes them [D9]."""
-    count = distiller.episodes_due
+def own_episodes(distiller, task, playing, workers, count):
+    """Episodes that the student plays, as `Distiller.add` takes them [D9]."""
     sizes = distiller.student.config
     observation = np.zeros((count, EPISODE_STEPS, sizes.dim_obs), np.float16)
     action, played = np.zeros((count, EPISODE_STEPS, sizes.dim_action), np.float16), [0] * count
@@ -2143,13 +2160,11 @@ def train_student(distiller, out, settings, playing, workers):
     began = saved = time.time()
     every = max(1, min(250, config.steps // 8))
     losses = []
+    play = functools.partial(own_episodes, distiller, settings["task"], playing, workers)
     with progress("distilling", config.steps, "step", distiller.t) as bar:
-        while distiller.t < config.steps:
-            if distiller.episodes_due:  # [D9]
-                distiller.add(*own_episodes(distiller, settings["task"], playing, workers))
-            rate = learning_rate(config, distiller.t)
-            losses.append(distiller.step())
-            check_finite({"loss is": losses[-1]}, distiller.t, config.lr)
+        for found in distiller.run(play):
+            losses.append(found)
+            check_finite({"loss is": found}, distiller.t, config.lr)
             bar.update()
             if distiller.t % every == 0 or distiller.t == config.steps:
                 loss, kl_reward, kl_value = np.mean(losses, 0)
@@ -2158,8 +2173,8 @@ def train_student(distiller, out, settings, playing, workers):
                 check_finite({"weights are": distiller.optimizer.vector,
                               "student's predictions are": rank}, distiller.t, config.lr)
                 curve.append([distiller.t, round(seconds, 2), float(loss), float(kl_reward),
-                              float(kl_value), rate, float(rank[0]), float(rank[-1]),
-                              float(returns[-1])])
+                              float(kl_value), learning_rate(config, distiller.t - 1),
+                              float(rank[0]), float(rank[-1]), float(returns[-1])])
                 bar.set_postfix_str(f"loss {loss:.4f} KL reward {kl_reward:.4f} value "
                                     f"{kl_value:.4f} rank {returns[-1]:.3f}", False)
                 write_curve(out / "curve.csv", CURVE, curve)
@@ -2291,7 +2306,7 @@ def command_distill(args):
                                       args.seed)) as distiller:
         agents = distiller.student.config.num_agents
         beside = useful_workers(agents) if args.plan_workers is None else args.plan_workers
-        shares(agents, beside)  # refuses too many
+        split_agents(agents, beside)  # refuses too many
         result = distil(distiller, args, planning, header, out)
     obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
     result.update(evaluate_both(expert, where, distiller.student, args, planning, config.q_alone))
@@ -2364,7 +2379,7 @@ def evaluate_both(expert, path, student, args, planning, q_alone):
             "expert_return_std": float(np.std(returns)),
             "student_return_mean": float(np.mean(theirs)),
             "student_return_std": float(np.std(theirs)),
-            "kept": kept(np.mean(theirs), np.mean(returns)),
+            "kept": return_kept(np.mean(theirs), np.mean(returns)),
             "student_returns": theirs, "expert_returns": returns}
 
 
@@ -2408,15 +2423,15 @@ def report(result, planning, eval_seed):
                         result["plan_ms_student"]))
     print_table(rows)
     rank, returns = (result[f"rank_correlation_{what}"] for what in ("by_step", "returns"))
-    share = "-" if result["kept"] is None else f"{result['kept']:.2f}"
-    print(f"\nreturn kept {share}, rank correlation of Q {rank[0]:.3f} (h = 0) to {rank[-1]:.3f} "
+    kept = "-" if result["kept"] is None else f"{result['kept']:.2f}"
+    print(f"\nreturn kept {kept}, rank correlation of Q {rank[0]:.3f} (h = 0) to {rank[-1]:.3f} "
           f"(h = {len(rank) - 1}), of the return {returns[-1]:.3f}, distilled in "
           f"{result['seconds']:.0f} s, {result['seconds_total']:.0f} s in all, {result['out']}/"
           + ("" if result["picture"] else
              "\n(no picture: pip install 'fac-tdmpc-ref[plots]' draws curve.png)"))
 
 
-def kept(student, expert):
+def return_kept(student, expert):
     """The share of the expert's return that a student keeps; None if there is nothing to keep."""
     return float(student / expert) if expert > 0 else None
 
@@ -2536,7 +2551,7 @@ def make_parser():
     sub.add_argument("--workers", type=natural, help="processes that run episodes side by side; 0: "
                      "the evaluation's in this one [cores]")
     sub.add_argument("--plan-workers", type=natural, help="processes beside this one that plan for "
-                     "a share of the agents, where planning is timed [one for every further core "
+                     "a part of the agents, where planning is timed [one for every further core "
                      "if that is faster than none]")
     sub.add_argument("--evaluate-expert", action="store_true",
                      help="measure the expert's return anew instead of reading its record")

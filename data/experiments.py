@@ -43,7 +43,7 @@ class Predictor:
     """
 
     def __init__(self, model, workers=0):
-        mine, *theirs = fac.shares(model.config.num_agents, workers)
+        mine, *theirs = fac.split_agents(model.config.num_agents, workers)
         self.model, self._arena = model.agents(mine.start, mine.stop), fac.Arena()
         sizes = self.model.config
         self._x = np.random.default_rng(0).standard_normal(

@@ -204,7 +204,7 @@ def hindsight(task, buffer, where, obs, reward, rng):
     episode, start = where
     later = buffer.observation[episode, rng.integers(start + 1, fac.EPISODE_STEPS + 1), 3:5]
     moved, fresh = rng.random((2, len(start))) < [[3 / 4], [1 / 3]]
-    back = np.where(fresh, obs[0, 3:5] - fac.new_targets(obs[0], rng), later.T).T
+    back = np.where(fresh, obs[0, 3:5] - fac.draw_targets(obs[0], rng), later.T).T
     fac.move_target(obs.swapaxes(1, 2), reward, back.astype(np.float32), moved, task)
 
 
@@ -485,7 +485,7 @@ def export(training, out, result):
     if training.student:
         result["lag"] = {str(p): lag(training.curve, p / 100) for p in (50, 75, 90)}
         if args.episodes:
-            result["ratio"] = fac.kept(result["student_return_mean"], result["return_mean"])
+            result["ratio"] = fac.return_kept(result["student_return_mean"], result["return_mean"])
     drawn = draw(out / "curve.png", training.curve, f"{args.task}, seed {args.seed}")
     print(f"\n{args.task}: {training.decisions:,} decisions, {result['updates']:,} updates, "
           f"{training.seconds / 60:.1f} minutes; {args.episodes} evaluation episodes\n")

@@ -156,7 +156,7 @@ class TorchDistiller:
     def step(self):
         """One gradient step on a fresh batch; returns the loss."""
         config = self.config
-        steps, batch, noise = config.terms, config.batch_size, config.noise_samples
+        steps, batch, noise = config.horizon + 1, config.batch_size, config.noise_samples
         with torch.no_grad():
             rows = self.starts[torch.randint(len(self.starts), (batch,))]
             actions = self.action[rows + torch.arange(steps)[:, None]].repeat_interleave(noise, 1)
@@ -188,7 +188,7 @@ class TorchDistiller:
 def distillation(threads, turns):
     """(ratio, our ms, PyTorch's ms) of a distillation step: reacher-hard, default settings.
 
-    One thread: both on one core; two: ours has the expert's side on the second.
+    One core, or two. `reuse` is 1: both compute the expert's predictions for every step.
     """
     expert, _ = fac.load_model(fac.data_file("reacher-hard", "expert.npz"))
     replay = fac.Replay(fac.data_file("reacher-hard", "replay.npz"))
@@ -196,7 +196,8 @@ def distillation(threads, turns):
     os.sched_setaffinity(0, list(cores)[:threads])
     torch.set_num_threads(threads)
     try:
-        with contextlib.closing(fac.Distiller(expert, replay, fac.DistillConfig())) as ours:
+        with contextlib.closing(fac.Distiller(expert, replay,
+                                               fac.DistillConfig(reuse=1))) as ours:
             theirs = TorchDistiller(ours, replay)
             return ratios(lambda: [ours.step() for _ in range(20)],
                           lambda: [theirs.step() for _ in range(20)], turns)

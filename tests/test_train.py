@@ -138,7 +138,8 @@ def test_train_prints_json_and_writes_what_distill_takes(trained, tmp_path):
     assert (found["steps"], found["updates"]) == (3000, 30) and set(found["lag"]) == {"50", "75",
                                                                                       "90"}
     assert set(os.listdir(folder)) - {"curve.png"} == {
-        "checkpoint.npz", "curve.csv", "expert.npz", "replay.npz", "student.npz"}
+        "checkpoint.npz", "curve.csv", "expert.json", "expert.npz", "replay.npz", "student.json",
+        "student.npz"}
     with open(folder / "curve.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [int(r["decisions"]) for r in rows] == [1000, 2000, 3000]
