@@ -698,19 +698,23 @@ def test_mujoco_and_dm_control_are_pinned_as_a_pair():
 
 
 def test_the_readme_distils_an_expert_of_one_s_own(tmp_path, monkeypatch):
-    """Its code, on a checkpoint in the official form and a replay of 20 short episodes."""
+    """Its commands and code, on a checkpoint in the official form and 20 short episodes."""
     torch = pytest.importorskip("torch")
+    import import_expert
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)
     fac.save_model("official.npz", fac.WorldModel.create(fac.ModelConfig(24, 6), rng, policy=True),
                    {"kind": "expert"})
     _, weights = fac.read_npz("official.npz", ("expert",))
     torch.save({"model": {key: torch.tensor(value) for key, value in weights.items()}}, "model.pt")
+    np.savez("data.npz", observation=rng.standard_normal((180, 24)),
+             action=rng.uniform(-1, 1, (180, 6)), continues=np.arange(180) % 9 < 8)
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    _, bring, distil = re.findall(r"```python\n(.*?)```", text, re.S)
-    exec(bring, {"obs": rng.standard_normal((180, 24)).astype(np.float16),
-                 "action": rng.uniform(-1, 1, (180, 6)).astype(np.float16),
-                 "more": np.arange(180) % 9 < 8})
+    command = "import_expert.py model.pt --task walker-walk --out mine --collect 20"
+    assert command in text and "--replay FILE.npz" in text
+    arguments = command.replace("--collect 20", "--replay data.npz").split()[1:]
+    assert import_expert.main(arguments) == 0
+    *_, distil = re.findall(r"```python\n(.*?)```", text, re.S)
     assert "own_episodes=0" in distil
     exec(distil.replace("own_episodes=0", "own_episodes=0, steps=2"), {"fac": fac})
     student, _ = fac.load_model("mine/student.npz")
