@@ -1023,23 +1023,24 @@ class Distiller:
     def episodes_due(self):
         """How many episodes the student is still to play before the next step [D9]."""
         quarter = 4 * self.t // self.config.steps
-        return quarter * self.config.own_episodes - len(self.own_starts) // self._own_length
+        return quarter * self.config.own_episodes - self.episodes_played
 
     @property
-    def _own_length(self):
-        """Starts in an episode of the student's own."""
-        return EPISODE_STEPS - self.config.horizon
+    def episodes_played(self):
+        """Episodes of the student's own in the data: each has as many starts as H leaves it."""
+        return len(self.own_starts) // (EPISODE_STEPS - self.config.horizon)
 
     def add(self, observation, action):
         """Let episodes (E, T, O), (E, T, A) that the student played join the data [D9]."""
         begins = len(self.replay.observation) + EPISODE_STEPS * np.arange(len(action))[:, None]
         self.replay.extend(observation, action)
-        self.own_starts = np.r_[self.own_starts, (begins + np.arange(self._own_length)).ravel()]
+        starts = begins + np.arange(EPISODE_STEPS - self.config.horizon)
+        self.own_starts = np.r_[self.own_starts, starts.ravel()]
         self._number = None  # its pool is drawn again, with them
 
     def state(self):
         """Everything that a resumed run needs."""
-        count = len(self.own_starts) // self._own_length
+        count = self.episodes_played
         observation, action = (x[len(x) - count * EPISODE_STEPS:].reshape(
             count, EPISODE_STEPS, x.shape[1]) for x in (self.replay.observation,
                                                         self.replay.action))
@@ -1158,6 +1159,7 @@ class AgentPlanner:
 
     def __init__(self, model, config):
         self.model, self.config = model, config
+        self.alone = dataclasses.replace(config, horizon=0)
         self.returns = Returns(model) if config.returns == "fast" else None
         self.reset([])
 
@@ -1171,9 +1173,7 @@ class AgentPlanner:
 
     def plan(self, z):
         """z (N, m, 1) -> the agents' first actions (N, d); keeps the warm start."""
-        config = self.config
-        if self.t % 200 < config.q_alone:  # [D5]
-            config = dataclasses.replace(config, horizon=0)
+        config = self.alone if self.t % 200 < self.config.q_alone else self.config  # [D5]
         self.t += 1
         returns = (self.returns.start(z, config) if self.returns else
                    functools.partial(h_step_return, self.model, z, config=config))
@@ -2037,12 +2037,10 @@ def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="eval
         raise UserError(f"episodes must be at least 1, not {episodes}")
     seeds = episode_seeds(seed, episodes)
     workers = worker_count(workers, episodes)
-    rewards, seconds, decided = (np.zeros((episodes, EPISODE_STEPS)), np.zeros(episodes),
-                                 [0] * episodes)
+    rewards, seconds = np.zeros((episodes, EPISODE_STEPS)), np.zeros(episodes)
     with progress(label, episodes * EPISODE_STEPS, "decision") as bar:
-        for i, part in _decisions(model, task, config, seeds, workers):
-            rewards[i, decided[i]:decided[i] + len(part)] = [reward for *_, reward, _ in part]
-            decided[i] += len(part)
+        for i, t, part in _decisions(model, task, config, seeds, workers):
+            rewards[i, t:t + len(part)] = [reward for *_, reward, _ in part]
             seconds[i] += sum(s for *_, s in part)
             bar.update(len(part))
             if bar.n >= EPISODE_STEPS:
@@ -2060,12 +2058,12 @@ def worker_count(workers, episodes):
 
 
 def _decisions(model, task, config, seeds, workers):
-    """Yields (episode, its next decisions, as `run_episode` gives them) until all are over."""
+    """Yields (episode, t, its decisions from t on, as `run_episode` gives them) until all end."""
     if workers < 1:
         environment, planner = Environment(task), Planner(model, config)
         for i, seed in enumerate(seeds):
-            for decision in run_episode(environment, planner, seed):
-                yield i, [decision]
+            for t, decision in enumerate(run_episode(environment, planner, seed)):
+                yield i, t, [decision]
         return
     waiting, running, left = list(enumerate(seeds)), {}, {}
     with Workers(_evaluation_worker, workers, "evaluation worker") as pool:
@@ -2075,9 +2073,9 @@ def _decisions(model, task, config, seeds, workers):
         while True:
             for w in ready:
                 if w in running:
-                    part = pool.receive(w)
+                    part, t = pool.receive(w), EPISODE_STEPS - left[w]
                     left[w] -= len(part)
-                    yield running[w], part
+                    yield running[w], t, part
                 if not left.get(w) and waiting:
                     running[w], episode_seed = waiting.pop(0)
                     left[w] = EPISODE_STEPS
@@ -2130,15 +2128,13 @@ def own_episodes(distiller, task, playing, workers, count):
     """Episodes that the student plays, as `Distiller.add` takes them [D9]."""
     sizes = distiller.student.config
     observation = np.zeros((count, EPISODE_STEPS, sizes.dim_obs), np.float16)
-    action, played = np.zeros((count, EPISODE_STEPS, sizes.dim_action), np.float16), [0] * count
-    first = len(distiller.own_starts) // distiller._own_length
-    seeds = training_seeds(distiller.seed, "own episode", first, count)
+    action = np.zeros((count, EPISODE_STEPS, sizes.dim_action), np.float16)
+    seeds = training_seeds(distiller.seed, "own episode", distiller.episodes_played, count)
     with progress("the student plays", count * EPISODE_STEPS, "decision") as bar:
-        for i, part in _decisions(distiller.student, task, playing, seeds,
-                                  worker_count(workers, count)):
-            for decision in part:
-                observation[i, played[i]], action[i, played[i]] = decision[:2]
-                played[i] += 1
+        for i, t, part in _decisions(distiller.student, task, playing, seeds,
+                                     worker_count(workers, count)):
+            observation[i, t:t + len(part)] = [obs for obs, *_ in part]
+            action[i, t:t + len(part)] = [act for _, act, *_ in part]
             bar.update(len(part))
     return observation, action
 
@@ -2294,13 +2290,14 @@ def command_distill(args):
     began = time.time()
     preset = paper_preset if args.preset == "paper" else lambda config: {}
     config = from_args(DistillConfig, args, **preset(DistillConfig))
-    planning = from_args(PlannerConfig, args, **preset(PlannerConfig), horizon=config.horizon)
+    made_for = {**preset(PlannerConfig), "horizon": config.horizon}
+    from_args(PlannerConfig, args, **made_for)  # wrong settings first, then wrong files
     lookup_task(args.task)
     if args.episodes < 1:
         raise UserError(f"episodes must be at least 1, not {args.episodes}")
     expert, header, replay, where = load_data(args)
-    if getattr(args, "PlannerConfig.discount") is None:
-        planning = dataclasses.replace(planning, discount=trained_discount(header, where))
+    made_for["discount"] = trained_discount(header, where)
+    planning = from_args(PlannerConfig, args, **made_for)
     out = output_folder(args.out or f"runs/{args.task}-{args.seed}")
     with contextlib.closing(Distiller(expert, replay, config, args.num_agents,
                                       args.seed)) as distiller:

@@ -17,7 +17,6 @@ numbers as in the paper. One step is 0.1 s (Table 1: freq 10).
 import argparse
 import dataclasses
 import json
-import os
 import sys
 import time
 
@@ -420,7 +419,7 @@ def run_demo(args, config):
 
 def print_comparison(args, runs, result):
     """What each run cost and where it went, and where the speed-up comes from."""
-    print(f"{args.steps} steps, seed {args.seed}, {os.cpu_count()} cores, "
+    print(f"{args.steps} steps, seed {args.seed}, {fac.cores()} cores, "
           f"{result['seconds_total']:.1f} s in all\n")
     rows = [("", "plan ms", "10% to", "final", "tip", "joint", *["net"] * 3, "bends", "bends"),
             ("", "median", "90%", "dist.", "path", "travel", "1", "2", "3", "0.1 s", "1 s")]
@@ -488,7 +487,7 @@ def main(argv=None):
         print(f"manipulator_demo.py: error: {error}", file=sys.stderr)
         return 2
     if args.json:
-        print(json.dumps({**result, "settings": vars(args), "cores": os.cpu_count()}))
+        print(json.dumps({**result, "settings": vars(args), "cores": fac.cores()}))
     return 0
 
 

@@ -227,7 +227,7 @@ def main():
     parser.add_argument("--json", action="store_true", help="print one JSON object as last line")
     args = parser.parse_args()
     result = {"central_ratio": None, "fac_ratio": {}, "distill_ratio": {}, "update_ratio": {},
-              "cores": os.cpu_count(), "torch": torch.__version__, "numpy": np.__version__}
+              "cores": fac.cores(), "torch": torch.__version__, "numpy": np.__version__}
 
     def show(what, found, threads=1):
         per = 20 if what.startswith("distillation") else 1
