@@ -40,9 +40,9 @@ import csv
 import dataclasses
 import difflib
 import functools
+import itertools
 import json
 import multiprocessing
-import multiprocessing.connection
 import operator
 import os
 import pickle
@@ -52,7 +52,7 @@ import tempfile
 import time
 import zlib
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -64,12 +64,9 @@ class UserError(Exception):
     """Something the user can mend: printed as one line, exit status 2."""
 
 
-# ======================================================================================
-# 1. Configuration
-# ======================================================================================
+# ==== 1. Configuration ================================================================
 
-
-EPISODE_STEPS = 500  # decisions in an episode: 1000 control steps of dm_control
+EPISODE_STEPS = 500  # T: decisions in an episode, 1000 control steps of dm_control
 ACTION_REPEAT = 2  # control steps a decision; their rewards are added
 
 
@@ -97,8 +94,12 @@ class Settings:
             if isinstance(value, float):
                 rules.append(("finite", np.isfinite(value)))
             if not all(holds for _, holds in rules):
-                raise UserError(f"{type(self).__name__}: {f.name} must be "
-                                f"{' and '.join(words for words, _ in rules)}, not {value!r}")
+                self.refuse(f.name, " and ".join(words for words, _ in rules))
+
+    def refuse(self, name, rule):
+        """Raise UserError for the value of the field `name`."""
+        raise UserError(f"{type(self).__name__}: {name} must be {rule}, not "
+                        f"{getattr(self, name)!r}")
 
 
 @dataclass(frozen=True)
@@ -116,13 +117,9 @@ class ModelConfig(Settings):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.num_agents < 1:
-            raise UserError(f"the number of agents must be one of {divisors(self.dim_action)}, "
-                            f"not {self.num_agents}")
-        if self.dim_action % self.num_agents:
-            raise UserError(f"{self.dim_action} action dimensions can't be shared by "
-                            f"{self.num_agents} agents; N may be one of "
-                            f"{divisors(self.dim_action)}")
+        if self.num_agents not in divisors(self.dim_action):
+            self.refuse("num_agents", f"one of {divisors(self.dim_action)}, as "
+                        f"{self.dim_action} action dimensions are shared evenly")
 
     @property
     def agent_actions(self):
@@ -136,7 +133,7 @@ class PlannerConfig(Settings):
     samples: int = field(128, "S: action sequences drawn in an iteration [D10]", paper=512, least=1)
     iterations: int = field(4, "refinements of the proposal in a decision [D10]", paper=6, least=1)
     elites: int = field(0, "sequences that refine the proposal; 0: samples / 8 (Table 2: 64)",
-                       least=0)
+                        least=0)
     pi_trajs: int = field(24, "policy proposals, where the model has a policy (Table 2)", least=0)
     horizon: int = field(3, "H of Equation 2: H rewards, then Q of action H + 1; 0: Q alone "
                          "(Table 2)", least=0, most=EPISODE_STEPS - 1)
@@ -148,7 +145,7 @@ class PlannerConfig(Settings):
     max_std: float = field(2.0, "first and largest sampling deviation (Table 2)", above=0)
     inverse_temperature: float = field(0.5, "an elite weighs exp(this * return); the `temperature` "
                                        "of Table 2, which TD-MPC's code multiplies by", least=0)
-    momentum: float = field(0.1, "share of the old mean in the new one (TD-MPC's code)",
+    momentum: float = field(0.1, "part of the old mean in the new one (TD-MPC's code)",
                             least=0, most=1)
     returns: str = field("fast", "the same return as it reads (plain: h_step_return), or fast",
                          choices=("fast", "plain"))
@@ -158,11 +155,9 @@ class PlannerConfig(Settings):
     def __post_init__(self):
         super().__post_init__()
         if self.elites > self.samples:
-            raise UserError(f"PlannerConfig: {self.elites} elites can't be chosen from "
-                            f"{self.samples} samples; lower elites or raise samples")
+            self.refuse("elites", f"at most samples ({self.samples})")
         if self.min_std > self.max_std:
-            raise UserError(f"PlannerConfig: min_std must be at most max_std ({self.max_std}), not "
-                            f"{self.min_std}")
+            self.refuse("min_std", f"at most max_std ({self.max_std})")
 
     @property
     def num_elites(self):
@@ -175,8 +170,7 @@ class DistillConfig(Settings):
     """Algorithm 1. `--preset paper` takes each field's paper value."""
     steps: int = field(12_000, "gradient steps [D1]", paper=100_000, least=1)
     batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=1)
-    noise_samples: int = field(5, "K: perturbations of each action (section 4.4) [D1]", paper=10,
-                               least=2)
+    noise_samples: int = field(5, "K: perturbations of each action [D1]", paper=10, least=2)
     noise_std: float = field(2.0, "largest deviation of the perturbations [D8]", paper=0.5, above=0)
     noise_std_min: float = field(0.2, "smallest; each state's is drawn between, evenly in the "
                                  "logarithm [D8]", paper=0.5, above=0)
@@ -187,17 +181,15 @@ class DistillConfig(Settings):
     horizon: int = field(3, "H: the loss sums over h = 0..H, planning looks as far (Table 2)",
                          least=0, most=EPISODE_STEPS - 1)
     q_alone: int = field(50, "decisions of every 200, the first, that the student's Q alone plans "
-                         "(H = 0), lest it stays where its rollouts hold it [D5]", paper=0,
-                         least=0, most=200)
-    lam: float = field(1.0, "lambda: weight of step h is lambda^h (rho in Table 2) [D5]", paper=0.5,
+                         "(H = 0) [D5]", paper=0, least=0, most=200)
+    lam: float = field(1.0, "lambda: step h weighs lambda^h (rho in Table 2) [D5]", paper=0.5,
                        least=0)
     reward_coef: float = field(0.5, "weight of the rewards' divergence (Table 2)", least=0)
     value_coef: float = field(0.1, "weight of each Q's divergence (Table 2)", least=0)
     temperature_student: float = field(0.5, "T_s of Equation 4 (authors' code)", above=0)
     temperature_expert: float = field(0.5, "T_e (authors' code)", above=0)
-    kl: str = field("forward", "forward: D(expert || student), as Hinton and Rusu distil; reverse: "
-                    "D(student || expert), Algorithm 1's order of arguments [D2]",
-                    paper="reverse", choices=("forward", "reverse"))
+    kl: str = field("forward", "forward: D(expert || student); reverse: D(student || expert), "
+                    "Algorithm 1's order [D2]", paper="reverse", choices=("forward", "reverse"))
     encoder_input: str = field("latent", "the student's encoder reads the observation, or the "
                                "expert's latent [D3]", paper="observation",
                                choices=("latent", "observation"))
@@ -208,11 +200,10 @@ class DistillConfig(Settings):
     grad_clip: float = field(10.0, "largest gradient norm (Table 2)", above=0)
     sizes: str = field("table2", "agent sizes: table2 (m = 50) or section51 (m = 512 // N)",
                        choices=("table2", "section51"))
-    new_targets: float = field(0.5, "reacher only: share of states whose target is drawn anew, as "
-                               "the task draws it [D7]", paper=0.0, least=0, most=1)
+    new_targets: float = field(0.5, "reacher only: states whose target is drawn anew [D7]",
+                               paper=0.0, least=0, most=1)
     own_episodes: int = field(16, "episodes that the student plays after each of the first three "
-                              "quarters of the steps; their states join the replay's [D9]",
-                              paper=0, least=0)
+                              "quarters of the steps, to learn from [D9]", paper=0, least=0)
     own_share: float = field(0.25, "share of states from the student's own episodes [D9]",
                              paper=0.0, least=0, most=1)
     held_out: float = field(0.05, "share of episodes held out for the rank correlation",
@@ -221,19 +212,17 @@ class DistillConfig(Settings):
     def __post_init__(self):
         super().__post_init__()
         if self.noise_std < self.noise_std_min:
-            raise UserError(f"DistillConfig: noise_std must be at least noise_std_min "
-                            f"({self.noise_std_min}), not {self.noise_std}")
+            self.refuse("noise_std", f"at least noise_std_min ({self.noise_std_min})")
 
 
 @dataclass(frozen=True)
 class ExpertConfig(Settings):
-    """TD-MPC's training (Equation 1), here and in data/train_expert.py."""
+    """TD-MPC's learning: Equation 1 and the sizes of its networks."""
     latent_dim: int = field(50, "m: latent features (Table 2)", least=1)
     enc_dim: int = field(256, "hidden width of the encoder (Table 2)", least=1)
     mlp_dim: int = field(512, "hidden width of the other networks (Table 2)", least=1)
     horizon: int = field(3, "H: steps of the latent rollout (Table 2)", least=1, most=EPISODE_STEPS)
     batch_size: int = field(512, "segments in an update (Table 2)", least=1)
-    updates_per_step: float = field(1.0, "updates for each decision", least=0)
     lr: float = field(5e-4, "Adam's learning rate (authors' expert)", above=0)
     discount: float = field(0.99, "gamma (Table 2)", least=0, most=1)
     lam: float = field(0.5, "lambda of Equation 1 (rho in Table 2)", least=0)
@@ -243,13 +232,6 @@ class ExpertConfig(Settings):
     grad_clip: float = field(10.0, "largest gradient norm (Table 2)", above=0)
     tau: float = field(0.01, "step of the moving-average targets (Table 2)", least=0, most=1)
     target_every: int = field(2, "updates between two steps of the targets (TD-MPC)", least=1)
-    std_start: float = field(0.5, "smallest sampling deviation at the start (TD-MPC)", least=0)
-    std_steps: int = field(25_000, "decisions over which it falls to the planner's min_std",
-                           least=0)
-    seed_decisions: int = field(4_000, "random decisions before the first update", least=0)
-    buffer_size: int = field(1_000_000, "replay capacity, transitions (Table 2)", least=1)
-    buffer_dtype: str = field("float32", "how the replay is kept in memory",
-                              choices=("float32", "float16"))
 
 
 def stream(seed, use, index=0):
@@ -282,18 +264,15 @@ def from_dict(config_class, values, where):
 
 def student_config(expert, num_agents, sizes, encoder_input):
     """A student's ModelConfig: Table 2's or section 5.1's latent; hidden max(512 // N, 50)."""
-    latent = 50 if sizes == "table2" or num_agents < 1 else 512 // num_agents
-    config = ModelConfig(expert.dim_obs, expert.dim_action, num_agents, latent, 256)
-    config = dataclasses.replace(config, mlp_dim=max(512 // num_agents, 50))
-    if encoder_input == "observation":
-        return config
-    return dataclasses.replace(config, expert_latent_dim=expert.num_agents * expert.latent_dim,
-                               expert_enc_dim=expert.enc_dim)
+    width = 512 // max(1, num_agents)
+    below = {} if encoder_input == "observation" else {
+        "expert_latent_dim": expert.num_agents * expert.latent_dim,
+        "expert_enc_dim": expert.enc_dim}
+    return ModelConfig(expert.dim_obs, expert.dim_action, num_agents,
+                       50 if sizes == "table2" else width, 256, max(width, 50), **below)
 
 
-# ======================================================================================
-# 2. Layers: each forward beside its backward
-# ======================================================================================
+# ==== 2. Layers: each forward beside its backward =====================================
 
 # Networks of TD-MPC's TOLD as layer kinds. A layer's place is its index in the official state
 # dict: layer 3 of the first Q is `_Q1.3.weight`, `_Q1.3.bias`.
@@ -303,54 +282,21 @@ QNET = ("linear", "norm", "tanh", "linear", "elu", "linear")
 NORM_EPS = 1e-5  # PyTorch's LayerNorm
 
 
-class Arena:
-    """Hands out arrays as np.empty does, the same ones in the same order after each `rewind`.
-
-    A training step asks for the same shapes every time; fresh megabytes would cost page faults.
-    """
-
-    def __init__(self):
-        self._arrays, self._next = [], 0
-
-    def rewind(self):
-        """Start over: whatever was handed out before may be overwritten from now on."""
-        self._next = 0
-
-    def empty(self, shape, dtype):
-        """An array of this shape and dtype with arbitrary contents."""
-        if self._next == len(self._arrays):
-            self._arrays.append(None)
-        array = self._arrays[self._next]
-        if array is None or array.shape != shape or array.dtype != dtype:
-            array = self._arrays[self._next] = np.empty(shape, dtype)
-        self._next += 1
-        return array
-
-
-# Every function takes `empty`: where its outputs live, np.empty or an Arena's.
-
-def linear(x, W, b, empty=np.empty):
+def linear(x, W, b):
     """y = W x + b.  x (N, in, B), W (N, out, in), b (N, out, 1) -> (N, out, B)."""
-    y = np.matmul(W, x, out=empty((*W.shape[:2], x.shape[2]), x.dtype))
+    y = W @ x
     y += b
     return y
 
 
-def linear_input_backward(dy, x, W, empty=np.empty):
-    """Gradient of y = W x + b by x: W^T dy."""
-    return np.matmul(W.swapaxes(1, 2), dy, out=empty(x.shape, x.dtype))
-
-
-def linear_backward(dy, x, W, empty=np.empty):
+def linear_backward(dy, x, W):
     """Gradients of y = W x + b: dx = W^T dy, dW = dy x^T, db = sum over B of dy."""
-    dx = linear_input_backward(dy, x, W, empty)
-    dW = np.matmul(dy, x.swapaxes(1, 2), out=empty(W.shape, x.dtype))
-    return dx, dW, dy.sum(2, keepdims=True)
+    return W.swapaxes(1, 2) @ dy, dy @ x.swapaxes(1, 2), dy.sum(2, keepdims=True)
 
 
-def elu(x, empty=np.empty):
+def elu(x):
     """y = x where x > 0, else exp(x) - 1: the larger of x and exp(min(x, 0)) - 1."""
-    y = np.clip(x, -np.inf, 0, out=empty(x.shape, x.dtype))  # 3 times as fast as minimum
+    y = np.clip(x, -np.inf, 0)  # 3 times as fast as minimum
     np.expm1(y, out=y)
     return np.maximum(x, y, out=y)
 
@@ -371,29 +317,26 @@ def tanh_backward(dy, y):
     return y
 
 
-def standardize(x, empty=np.empty):
+def standardize(x):
     """x_hat = (x - mean) / sqrt(var + eps) over the features of each agent; also 1 / sqrt."""
-    x_hat = np.subtract(x, x.mean(1, keepdims=True), out=empty(x.shape, x.dtype))
+    x_hat = x - x.mean(1, keepdims=True)
     var = np.einsum("nfb,nfb->nb", x_hat, x_hat)[:, None] / x.shape[1]
     scale = 1 / np.sqrt(var + x.dtype.type(NORM_EPS))
     x_hat *= scale
     return x_hat, scale
 
 
-def norm(x, g, b, empty=np.empty):
+def norm(x, g, b):
     """LayerNorm: y = g x_hat + b.  x (N, F, B), g and b (N, F, 1)."""
-    y, _ = standardize(x, empty)
-    y *= g
-    y += b
-    return y
+    return g * standardize(x)[0] + b
 
 
-def norm_backward(dy, x, g, empty=np.empty):
+def norm_backward(dy, x, g):
     """Gradients of y = g x_hat + b; x_hat has no part that shifts or scales all features."""
-    x_hat, scale = standardize(x, empty)
+    x_hat, scale = standardize(x)
     db = dy.sum(2, keepdims=True)
     dg = np.einsum("nfb,nfb->nf", dy, x_hat)[:, :, None]
-    dx = np.multiply(dy, g, out=empty(x.shape, x.dtype))
+    dx = dy * g
     x_hat *= np.einsum("nfb,nfb->nb", dx, x_hat)[:, None] / x.shape[1]
     dx -= dx.mean(1, keepdims=True)
     dx -= x_hat
@@ -401,35 +344,34 @@ def norm_backward(dy, x, g, empty=np.empty):
     return dx, dg, db
 
 
-def forward(kinds, params, name, x, tape=None, empty=np.empty):
+def forward(kinds, params, name, x, tape=None):
     """Run a network on x (N, in, B). A tape (list) keeps x and every layer's output."""
     if tape is not None:
         tape.append(x)
     for i, kind in enumerate(kinds):
         if kind in ("linear", "norm"):
             layer = linear if kind == "linear" else norm
-            x = layer(x, params[f"{name}.{i}.weight"], params[f"{name}.{i}.bias"], empty)
+            x = layer(x, params[f"{name}.{i}.weight"], params[f"{name}.{i}.bias"])
         elif kind == "elu":
-            x = elu(x, empty)
+            x = elu(x)
         else:
-            x = np.tanh(x, out=empty(x.shape, x.dtype))
+            x = np.tanh(x)
         if tape is not None:
             tape.append(x)
     return x
 
 
-def backward(kinds, params, name, tape, dy, grads, empty=np.empty):
+def backward(kinds, params, name, tape, dy, grads):
     """Walk `forward` back: adds parameter gradients to `grads` (None: not wanted), returns dx.
 
-    Uses the tape up: activations are overwritten by gradients on the way.
-    """
+    Uses the tape up: activations are overwritten by gradients on the way."""
     for i in reversed(range(len(kinds))):
         kind, x, y = kinds[i], tape[i], tape[i + 1]
         if kind == "linear" and grads is None:
-            dy = linear_input_backward(dy, x, params[f"{name}.{i}.weight"], empty)
+            dy = params[f"{name}.{i}.weight"].swapaxes(1, 2) @ dy
         elif kind in ("linear", "norm"):
             layer_backward = linear_backward if kind == "linear" else norm_backward
-            dy, dW, db = layer_backward(dy, x, params[f"{name}.{i}.weight"], empty)
+            dy, dW, db = layer_backward(dy, x, params[f"{name}.{i}.weight"])
             if grads is not None:
                 grads[f"{name}.{i}.weight"] += dW
                 grads[f"{name}.{i}.bias"] += db
@@ -461,64 +403,41 @@ def clip_norm(gradient, largest):
     return length
 
 
-class Optimizer:
-    """Adam with clipping on a dict of arrays: all of them views of one vector, so that a step is
-    a few vector calls. Add to `grads`, then `step`, which sets them to zero again."""
+class Adam:
+    """Adam as PyTorch defines it, with clipping, on a dict of arrays: all of them views of one
+    vector, so that a step is a few vector calls. Add to `grads`, then `step`."""
 
-    def __init__(self, arrays):
+    def __init__(self, arrays, betas=(0.9, 0.999), eps=1e-8):
         self.vector, self.params = flatten(arrays)
         self.gradient, self.grads = flatten({k: np.zeros_like(v) for k, v in arrays.items()})
-        self.adam = Adam(len(self.vector), self.vector.dtype)
+        self.m, self.v = np.zeros_like(self.vector), np.zeros_like(self.vector)
+        self.betas, self.eps, self.t = betas, eps, 0
 
-    def step(self, lr, clip):
-        """One step down the gradient, clipped to norm `clip`; returns the norm before."""
-        length = clip_norm(self.gradient, clip)
-        self.adam.step(self.vector, self.gradient, lr)
+    def step(self, lr, clip=np.inf):
+        """params -= lr m_hat / (sqrt(v_hat) + eps) of the gradient, clipped to norm `clip`.
+
+        Sets the gradient to zero again; returns its norm."""
+        length, (beta1, beta2) = clip_norm(self.gradient, clip), self.betas
+        self.t += 1
+        self.m += (1 - beta1) * (self.gradient - self.m)
+        self.v += (1 - beta2) * (self.gradient ** 2 - self.v)
+        root = np.sqrt(self.v / (1 - beta2 ** self.t))
+        self.vector -= lr / (1 - beta1 ** self.t) * self.m / (root + self.eps)
         self.gradient[:] = 0
         return length
 
     def state(self):
         """Everything that a resumed run needs."""
-        return {"weights": self.vector, "adam_m": self.adam.m, "adam_v": self.adam.v,
-                "step": np.int64(self.adam.t)}
+        return {"weights": self.vector, "adam_m": self.m, "adam_v": self.v,
+                "step": np.int64(self.t)}
 
     def load(self, state):
         """Go on from a `state`."""
-        self.vector[:], self.adam.m[:], self.adam.v[:] = (state[k] for k in
-                                                          ("weights", "adam_m", "adam_v"))
-        self.adam.t = int(state["step"])
+        self.vector[:], self.m[:], self.v[:] = (state[k] for k in ("weights", "adam_m", "adam_v"))
+        self.t = int(state["step"])
 
 
-class Adam:
-    """Adam as PyTorch defines it (bias corrections outside the root's epsilon)."""
-
-    def __init__(self, size, dtype=F32, betas=(0.9, 0.999), eps=1e-8):
-        self.m, self.v, self._work = (np.zeros(size, dtype) for _ in range(3))
-        self.betas, self.eps, self.t = betas, eps, 0
-
-    def step(self, params, grads, lr):
-        """params -= lr m_hat / (sqrt(v_hat) + eps), in place, on vectors."""
-        self.t += 1
-        beta1, beta2 = self.betas
-        correct1, correct2 = 1 - beta1 ** self.t, 1 - beta2 ** self.t
-        work = self._work
-        self.m *= beta1                                 # m = beta1 m + (1 - beta1) g
-        self.m += np.multiply(grads, 1 - beta1, out=work)
-        np.multiply(grads, grads, out=work)             # v = beta2 v + (1 - beta2) g^2
-        work *= 1 - beta2
-        self.v *= beta2
-        self.v += work
-        np.sqrt(self.v, out=work)
-        work /= correct2 ** 0.5
-        work += self.eps
-        np.divide(self.m, work, out=work)
-        work *= lr / correct1
-        params -= work
-
-
-# ======================================================================================
-# 3. World model (sections 3.2 and 4.2)
-# ======================================================================================
+# ==== 3. World model (sections 3.2 and 4.2) ===========================================
 
 
 class WorldModel:
@@ -527,8 +446,7 @@ class WorldModel:
     `params` maps official TD-MPC state-dict names to arrays with a leading agent axis, all of
     one dtype (float32; float64 only to check gradients). The encoder is centralized (N = 1);
     `_pi`, the expert's policy, and `_expert_encoder`, the frozen encoder below a student's own,
-    are there for some models only.
-    """
+    are there for some models only."""
 
     def __init__(self, config, params):
         self.config, self.params = config, params
@@ -545,9 +463,9 @@ class WorldModel:
             params[f"{name}.{i}.bias"] = np.zeros((*shape[:2], 1), dtype)
         return cls(config, params)
 
-    def encode(self, obs, empty=np.empty):
+    def encode(self, obs):
         """s = f_E(g).  obs (O, B) -> latents (N, m, B)."""
-        return self.encode_features(self.encoder_features(obs), None, empty)
+        return self.encode_features(self.encoder_features(obs))
 
     def encoder_features(self, obs):
         """What the trained encoder reads, (1, F, B): the observation or the expert's latent."""
@@ -556,9 +474,9 @@ class WorldModel:
             x = forward(ENCODER, self.params, "_expert_encoder", x)
         return x
 
-    def encode_features(self, x, tape=None, empty=np.empty):
+    def encode_features(self, x, tape=None):
         """The trained encoder on (1, F, B); its output is cut into the agents' latents."""
-        z = forward(ENCODER, self.params, "_encoder", x, tape, empty)
+        z = forward(ENCODER, self.params, "_encoder", x, tape)
         return z.reshape(self.config.num_agents, self.config.latent_dim, -1)
 
     def next(self, z, a):
@@ -569,15 +487,15 @@ class WorldModel:
         """r^i = f_R^i(s^i, a^i) -> (N, B); the global reward is the sum over N."""
         return forward(MLP, self.params, "_reward", np.concatenate([z, a], 1))[:, 0]
 
-    def q(self, z, a, empty=np.empty):
+    def q(self, z, a):
         """Both values q^i = f_Q^i(s^i, a^i) -> two (N, B); the global ones are the sums."""
         x = np.concatenate([z, a], 1)
-        return tuple(forward(QNET, self.params, name, x, None, empty)[:, 0]
+        return tuple(forward(QNET, self.params, name, x)[:, 0]
                      for name in ("_Q1", "_Q2"))
 
-    def policy(self, z, empty=np.empty):
+    def policy(self, z):
         """The expert's policy mean, z (1, m, B) -> (1, A, B) in (-1, 1)."""
-        return np.tanh(forward(MLP, self.params, "_pi", z, None, empty))
+        return np.tanh(forward(MLP, self.params, "_pi", z))
 
     @property
     def has_policy(self):
@@ -625,23 +543,22 @@ def layers(config, policy=False):
 HEADS = (("_reward", MLP), ("_Q1", QNET), ("_Q2", QNET))
 
 
-def unroll(model, z, actions, transitions, tapes=None, empty=np.empty):
+def unroll(model, z, actions, transitions, tapes=None):
     """Roll a model's latent out under given actions, every column on its own trajectory.
 
     z (N, m, B), actions (L, A, B, K): K perturbed copies of a trajectory. Returns the networks'
     input x (N, m + d, L * B * K), columns in the order (L, B, K), with s_{h+1} = f_T(s_h, a_h),
-    and the last latents (N, m, B * K) if there are L transitions (else there are L - 1).
-    """
+    and the last latents (N, m, B * K) if there are L transitions (else there are L - 1)."""
     steps, _, batch, noise = actions.shape
     n, m, d = model.config.num_agents, model.config.latent_dim, model.config.agent_actions
     columns = batch * noise
-    x = empty((n, m + d, steps * columns), z.dtype)
+    x = np.empty((n, m + d, steps * columns), z.dtype)
     x[:, m:] = actions.reshape(steps, n, d, columns).transpose(1, 2, 0, 3).reshape(n, d, -1)
     x[:, :m, :columns] = np.repeat(z, noise, axis=2)
     end = None
     for h in range(transitions):
         end = forward(MLP, model.params, "_dynamics", x[:, :, h * columns:(h + 1) * columns],
-                      keep(tapes, f"_dynamics {h}"), empty)
+                      keep(tapes, f"_dynamics {h}"))
         if h < steps - 1:
             x[:, :m, (h + 1) * columns:(h + 2) * columns] = end
     return x, end
@@ -652,47 +569,43 @@ def keep(tapes, name):
     return None if tapes is None else tapes.setdefault(name, [])
 
 
-def predict(model, z, actions, tapes=None, empty=np.empty):
+def predict(model, z, actions, tapes=None):
     """Global rewards and both Q at every step of a rollout: three (L, B, K), as in `unroll`."""
-    x, _ = unroll(model, z, actions, len(actions) - 1, tapes, empty)
-    return run_heads(model, x, actions, tapes, empty)
+    x, _ = unroll(model, z, actions, len(actions) - 1, tapes)
+    return run_heads(model, x, actions, tapes)
 
 
-def run_heads(model, x, actions, tapes=None, empty=np.empty):
+def run_heads(model, x, actions, tapes=None):
     """Global reward and both Q of `unroll`'s x: the sums over agents, three (L, B, K)."""
     steps, _, batch, noise = actions.shape
-    return [forward(kinds, model.params, name, x, keep(tapes, name), empty).sum(0)
+    return [forward(kinds, model.params, name, x, keep(tapes, name)).sum(0)
             .reshape(steps, batch, noise) for name, kinds in HEADS]
 
 
-def predict_backward(model, tapes, d_outputs, grads, empty=np.empty, d_latents=None):
+def predict_backward(model, tapes, d_outputs, grads, d_latents=None):
     """Walk `unroll` and `run_heads` back; adds to `grads`, returns dz (N, m, B).
 
     d_outputs: gradients of the three outputs; d_latents (L, N, m, B * K): of s_1, ..., s_L, where
-    there were L transitions.
-    """
+    there were L transitions."""
     n, m = model.config.num_agents, model.config.latent_dim
     steps, batch, noise = d_outputs[0].shape
     columns = batch * noise
     dx = 0
     for (name, kinds), d_out in zip(HEADS, d_outputs):
         # the global output is the sum over agents: each share has the same gradient
-        d_share = np.ascontiguousarray(np.broadcast_to(d_out.reshape(1, 1, -1),
-                                                       (n, 1, steps * columns)))
-        dx = dx + backward(kinds, model.params, name, tapes[name], d_share, grads, empty)
+        d_share = np.repeat(d_out.reshape(1, 1, -1), n, 0)
+        dx = dx + backward(kinds, model.params, name, tapes[name], d_share, grads)
     for h in reversed(range(steps - (d_latents is None))):
         d_next = 0 if d_latents is None else d_latents[h]
         if h < steps - 1:
             d_next = d_next + dx[:, :m, (h + 1) * columns:(h + 2) * columns]
         dx[:, :, h * columns:(h + 1) * columns] += backward(
             MLP, model.params, "_dynamics", tapes[f"_dynamics {h}"],
-            np.ascontiguousarray(d_next), grads, empty)
+            np.ascontiguousarray(d_next), grads)
     return dx[:, :m, :columns].reshape(n, m, batch, noise).sum(3)
 
 
-# ======================================================================================
-# 4. TD-MPC's objective, Equation 1
-# ======================================================================================
+# ==== 4. TD-MPC's objective, Equation 1 ===============================================
 
 POLICY_STD, POLICY_CUT = 0.05, 0.3  # TD-MPC's policy noise: its deviation, and where it is cut
 
@@ -702,20 +615,19 @@ def policy_noise(shape, rng):
     return np.clip(rng.standard_normal(shape, F32) * F32(POLICY_STD), -POLICY_CUT, POLICY_CUT)
 
 
-def td_targets(model, target, obs, reward, noise, discount, empty=np.empty):
+def td_targets(model, target, obs, reward, noise, discount):
     """What Equation 1 holds fixed: latents of the moving-average encoder, and TD targets.
 
     obs (H, O, B): the observation after each action; reward (H, B); noise (A, H * B): the
     policy's. Returns (1, m, H * B), columns ordered (H, B), and the targets
-    r_h + gamma min(Q1, Q2)(s_{h+1}, pi(s_{h+1})) (H, B) with the moving averages of Q.
-    """
+    r_h + gamma min(Q1, Q2)(s_{h+1}, pi(s_{h+1})) (H, B) with the moving averages of Q."""
     after = np.ascontiguousarray(obs.swapaxes(0, 1)).reshape(obs.shape[1], -1)
-    z = model.encode(after, empty)
-    q = np.minimum(*target.q(z, np.clip(model.policy(z, empty) + noise, -1, 1), empty))
-    return target.encode(after, empty), reward + discount * q.reshape(reward.shape)
+    z = model.encode(after)
+    q = np.minimum(*target.q(z, np.clip(model.policy(z) + noise, -1, 1)))
+    return target.encode(after), reward + discount * q.reshape(reward.shape)
 
 
-def equation_1(model, obs, actions, reward, latents, td, config, grads=None, empty=np.empty):
+def equation_1(model, obs, actions, reward, latents, td, config, grads=None):
     """Equation 1 and, into the dict `grads`, its gradients.
 
         1/H sum_{h=0}^{H-1} lambda^h [c_T |s_{h+1} - latents_h|^2 + c_R (r_h - reward_h)^2
@@ -725,17 +637,16 @@ def equation_1(model, obs, actions, reward, latents, td, config, grads=None, emp
 
     obs (O, B): the first ones; actions (H, A, B); reward (H, B); latents and td from `td_targets`.
     Returns the loss, its three sums over h without coefficients, and the rollout s_0, ..., s_H
-    (1, m, (H + 1) * B).
-    """
+    (1, m, (H + 1) * B)."""
     steps, _, batch = actions.shape
     tapes, encoder_tape, actions = {}, [], actions[..., None]           # K = 1
-    z = model.encode_features(obs[None], encoder_tape, empty)
-    x, end = unroll(model, z, actions, steps, tapes, empty)
+    z = model.encode_features(obs[None], encoder_tape)
+    x, end = unroll(model, z, actions, steps, tapes)
     rollout = np.concatenate([x[:, :z.shape[1]], end], 2)
     weights = (config.lam ** np.arange(steps) / batch).astype(z.dtype)[:, None]
     terms, d_outputs = [], []
     coefs = (config.reward_coef, config.value_coef, config.value_coef)
-    for coef, output, goal in zip(coefs, run_heads(model, x, actions, tapes, empty),
+    for coef, output, goal in zip(coefs, run_heads(model, x, actions, tapes),
                                   (reward, td, td)):
         error = output[..., 0] - goal
         terms.append(float((weights * error ** 2).sum()))
@@ -747,31 +658,29 @@ def equation_1(model, obs, actions, reward, latents, td, config, grads=None, emp
     loss = np.dot(terms, [config.consistency_coef, config.reward_coef, config.value_coef]) / steps
     if grads is not None:
         d_latents = 2 * config.consistency_coef / steps * weights * gap
-        dz = predict_backward(model, tapes, d_outputs, grads, empty,
-                              d_latents.transpose(2, 0, 1, 3))
-        backward(ENCODER, model.params, "_encoder", encoder_tape, dz, grads, empty)
+        dz = predict_backward(model, tapes, d_outputs, grads, d_latents.transpose(2, 0, 1, 3))
+        backward(ENCODER, model.params, "_encoder", encoder_tape, dz, grads)
     return float(loss), terms, rollout
 
 
-def policy_loss(model, rollout, noise, lam, grads, empty=np.empty):
+def policy_loss(model, rollout, noise, lam, grads):
     """- sum_h lambda^h mean over B of min(Q1, Q2)(s_h, pi(s_h) + noise); gradients for `_pi` only.
 
     rollout (1, m, L * B): the latents of `equation_1`, held fixed; noise (A, L, B). The clipping
-    of the noisy action to [-1, 1] lets gradients through, as in TD-MPC's code.
-    """
+    of the noisy action to [-1, 1] lets gradients through, as in TD-MPC's code."""
     tape, q_tapes, (dim_action, steps, batch) = [], ([], []), noise.shape
-    mu = np.tanh(forward(MLP, model.params, "_pi", rollout, tape, empty))
+    mu = np.tanh(forward(MLP, model.params, "_pi", rollout, tape))
     a = np.clip(mu + noise.reshape(1, dim_action, -1), -1, 1)
     x = np.concatenate([rollout, a], 1)
-    q1, q2 = (forward(QNET, model.params, name, x, q_tape, empty)
+    q1, q2 = (forward(QNET, model.params, name, x, q_tape)
               for name, q_tape in zip(("_Q1", "_Q2"), q_tapes))
     weights = np.repeat(lam ** np.arange(steps) / batch, batch).astype(x.dtype)
     first = np.where(q1 == q2, F32(0.5), q1 < q2).astype(x.dtype)  # a tie counts half for each
     da = 0
     for name, q_tape, smaller in (("_Q1", q_tapes[0], first), ("_Q2", q_tapes[1], 1 - first)):
-        dx = backward(QNET, model.params, name, q_tape, -weights * smaller, None, empty)
+        dx = backward(QNET, model.params, name, q_tape, -weights * smaller, None)
         da = da + dx[:, rollout.shape[1]:]
-    backward(MLP, model.params, "_pi", tape, tanh_backward(da, mu), grads, empty)
+    backward(MLP, model.params, "_pi", tape, tanh_backward(da, mu), grads)
     return -float((weights * np.minimum(q1, q2)).sum())
 
 
@@ -781,9 +690,9 @@ class Learner:
     def __init__(self, sizes, config, rng, dtype=F32):
         model = WorldModel.create(sizes, rng, policy=True, dtype=dtype)
         policy = {k: v for k, v in model.params.items() if k.startswith("_pi")}
-        self.config, self._arena = config, Arena()
-        self.optimizer = Optimizer({k: v for k, v in model.params.items() if k not in policy})
-        self.policy_optimizer = Optimizer(policy)
+        self.config = config
+        self.optimizer = Adam({k: v for k, v in model.params.items() if k not in policy})
+        self.policy_optimizer = Adam(policy)
         self.model = WorldModel(sizes, {**self.optimizer.params, **self.policy_optimizer.params})
         self.slow_vector, slow = flatten(self.optimizer.params)
         self.target = WorldModel(sizes, slow)
@@ -792,19 +701,15 @@ class Learner:
         """One step of Equation 1, one of the policy; every `target_every` times the averages.
 
         obs (H + 1, O, B), actions (H, A, B), reward (H, B). Returns the three terms of Equation 1
-        and the latents s_0, ..., s_H (1, m, (H + 1) * B).
-        """
+        and the latents s_0, ..., s_H (1, m, (H + 1) * B)."""
         config, (steps, dim_action, batch) = self.config, actions.shape
-        self._arena.rewind()
         noise = policy_noise((dim_action, 2 * steps + 1, batch), rng)
         latents, td = td_targets(self.model, self.target, obs[1:], reward,
-                                 noise[:, :steps].reshape(dim_action, -1), config.discount,
-                                 self._arena.empty)
+                                 noise[:, :steps].reshape(dim_action, -1), config.discount)
         _, terms, rollout = equation_1(self.model, obs[0], actions, reward, latents, td, config,
-                                       self.optimizer.grads, self._arena.empty)
+                                       self.optimizer.grads)
         self.optimizer.step(config.lr, config.grad_clip)
-        policy_loss(self.model, rollout, noise[:, steps:], config.lam,
-                    self.policy_optimizer.grads, self._arena.empty)
+        policy_loss(self.model, rollout, noise[:, steps:], config.lam, self.policy_optimizer.grads)
         self.policy_optimizer.step(config.lr, config.grad_clip)
         if self.updates % config.target_every == 0:  # averages += tau (weights - averages)
             self.slow_vector += config.tau * (self.optimizer.vector - self.slow_vector)
@@ -813,12 +718,10 @@ class Learner:
     @property
     def updates(self):
         """Updates made so far."""
-        return self.optimizer.adam.t
+        return self.optimizer.t
 
 
-# ======================================================================================
-# 5. Model distillation (section 4.4, Algorithm 1, Equation 4)
-# ======================================================================================
+# ==== 5. Model distillation (section 4.4, Algorithm 1, Equation 4) ====================
 
 # A softmax doesn't see a constant, so these have no gradient but rounding errors, and Adam lets
 # them wander. Planning doesn't see a constant either.
@@ -835,8 +738,7 @@ def soft_kl(student, expert, temperature_student, temperature_expert, kind="forw
     """D(p_e || p_s) of p_e = softmax(expert / T_e) and p_s = softmax(student / T_s), Equation 4.
 
     student, expert (..., K): predictions for the K perturbed actions of a state. "reverse" is
-    D(p_s || p_e) [D2]. Returns the divergence (...) and its gradient by `student` (..., K).
-    """
+    D(p_s || p_e) [D2]. Returns the divergence (...) and its gradient by `student` (..., K)."""
     log_s = log_softmax(student / temperature_student)
     log_e = log_softmax(expert / temperature_expert)
     p_s, p_e = np.exp(log_s), np.exp(log_e)
@@ -848,18 +750,17 @@ def soft_kl(student, expert, temperature_student, temperature_expert, kind="forw
     return kl, p_s * (gap - kl[..., None]) / temperature_student
 
 
-def distill_loss(student, features, actions, targets, config, grads=None, empty=np.empty):
+def distill_loss(student, features, actions, targets, config, grads=None):
     """The loss in line 6 of Algorithm 1 and, into the dict `grads`, its gradients.
 
         mean over B of sum_h lambda^h [c_R D(R_h) + c_Q (D(Q1_h) + D(Q2_h))]
 
     features (1, F, B): what the student's encoder reads in the first states; actions
     (L, A, B, K): perturbed; targets: the expert's `predict` for them. Returns the loss and
-    the mean divergences of reward and value over steps and states.
-    """
+    the mean divergences of reward and value over steps and states."""
     tapes, encoder_tape = {}, []
-    z = student.encode_features(features, encoder_tape, empty)
-    outputs = predict(student, z, actions, tapes, empty)
+    z = student.encode_features(features, encoder_tape)
+    outputs = predict(student, z, actions, tapes)
     steps, batch, _ = outputs[0].shape
     weights = (config.lam ** np.arange(steps) / batch).astype(z.dtype)[:, None]
     loss, means, d_outputs = 0.0, [], []
@@ -871,22 +772,21 @@ def distill_loss(student, features, actions, targets, config, grads=None, empty=
         means.append(float(kl.mean()))
         d_outputs.append(coef * weights[..., None] * d_output)
     if grads is not None:
-        dz = predict_backward(student, tapes, d_outputs, grads, empty)
+        dz = predict_backward(student, tapes, d_outputs, grads)
         backward(ENCODER, student.params, "_encoder", encoder_tape,
-                 dz.reshape(1, -1, batch), grads, empty)
+                 dz.reshape(1, -1, batch), grads)
     return loss, means[0], (means[1] + means[2]) / 2
 
 
 def new_student(expert, num_agents, config, seed):
     """A fresh student of an expert, and the optimizer that holds its trained weights.
 
-    Where the student reads the expert's latent, it shares the expert's own encoder arrays [D3].
-    """
+    Where the student reads the expert's latent, it shares the expert's own encoder arrays [D3]."""
     sizes = student_config(expert.config, num_agents, config.sizes, config.encoder_input)
     student = WorldModel.create(sizes, stream(seed, "student"))
     frozen = {"_expert" + k: v for k, v in expert.params.items()
               if k.startswith("_encoder.") and config.encoder_input == "latent"}
-    optimizer = Optimizer({k: v for k, v in student.params.items()
+    optimizer = Adam({k: v for k, v in student.params.items()
                            if not k.startswith("_expert")})
     return optimizer, WorldModel(sizes, {**optimizer.params, **frozen})
 
@@ -899,12 +799,11 @@ def learning_rate(config, t):
     return float(rate)
 
 
-def perturbed_batch(expert, student, obs, actions, config, rng, empty=np.empty):
+def perturbed_batch(expert, student, obs, actions, config, rng):
     """Features (1, F, B), perturbed actions (L, A, B, K) and the expert's predictions for them.
 
     obs (O, B) and actions (L, A, B) come from the replay. Each state has a deviation of its own
-    for eps_h, and a_h + eps_h is clipped [D8].
-    """
+    for eps_h, and a_h + eps_h is clipped [D8]."""
     noise = rng.standard_normal((*actions.shape, config.noise_samples), F32)
     span = np.log([config.noise_std_min, config.noise_std])
     noise *= np.exp(rng.uniform(*span, actions.shape[-1])).astype(F32)[:, None]
@@ -913,19 +812,18 @@ def perturbed_batch(expert, student, obs, actions, config, rng, empty=np.empty):
         np.clip(perturbed, -1, 1, out=perturbed)
     z = expert.encode(obs)
     features = z.reshape(1, -1, z.shape[-1]) if student.config.expert_latent_dim else obs[None]
-    return features, perturbed, predict(expert, z, perturbed, empty=empty)
+    return features, perturbed, predict(expert, z, perturbed)
 
 
-POOL = 4096  # states whose predictions by the expert are computed in one go
+POOL, PART = 4096, 256  # states whose expert's predictions are computed in one go, by such parts
 
 
 class Distiller:
     """Algorithm 1: one `step` after the other, reproducible from the seed, and from `state`.
 
     The expert is frozen: what it predicts for a pool of states and their perturbed actions is
-    computed once, on a thread of its own, and learned from `reuse` times. Two more threads learn
-    from half of each batch: NumPy lets go of the interpreter inside its products.
-    """
+    computed once and learned from `reuse` times. Two threads share that, and each step's batch:
+    NumPy lets go of the interpreter inside its products."""
 
     def __init__(self, expert, replay, config, num_agents=None, seed=0):
         sizes = expert.config
@@ -941,40 +839,34 @@ class Distiller:
             self.optimizer, self.student = new_student(expert, agents, config, seed)
         needed = config.steps * config.batch_size // config.reuse
         self.pool_size = max(config.batch_size, min(POOL, needed))
-        self._number, self._pool, self._next = None, None, None
-        self._threads = ThreadPoolExecutor(3)
-        self._learners = [(Arena(), *flatten({k: np.zeros_like(v) for k, v in
-                                              self.optimizer.params.items()})) for _ in range(2)]
+        self._number = self._pool = None
+        self._threads = ThreadPoolExecutor(2)
+        self._halves = [flatten({k: np.zeros_like(v) for k, v in self.optimizer.params.items()})
+                        for _ in range(2)]
         self._blas = one_thread()  # until `close`, in all threads
 
-    def pool(self, number):
-        """Line 4 and the expert's part for one pool: features, perturbed actions, targets."""
-        rng, parts = stream(self.seed, "pool", number), []
-        reacher = str(self.replay.header.get("task")).startswith("reacher")
-        for size in np.diff(np.r_[0:self.pool_size:256, self.pool_size]):  # what fits the cache
-            starts = rng.choice(self.train_starts, size)
-            if len(self.own_starts):  # [D9]
-                own = rng.random(size) < self.config.own_share
-                starts[own] = rng.choice(self.own_starts, own.sum())
-            obs, actions = self.replay.sequences(starts, self.config.horizon + 1)
-            if reacher:  # [D7]
-                chosen = rng.random(size) < self.config.new_targets
-                obs[3:5, chosen] = draw_targets(obs[:, chosen], rng)
-            parts.append(perturbed_batch(self.expert, self.student, obs, actions, self.config, rng))
-        features, actions, targets = zip(*parts)
-        return (np.concatenate(features, 2), np.concatenate(actions, 2),
-                [np.concatenate(target, 1) for target in zip(*targets)])
+    def draw(self, number, part, size):
+        """Line 4 and the expert's part of line 5 for a part of a pool, as `perturbed_batch`."""
+        rng = stream(self.seed, f"pool {number}", part)
+        starts = rng.choice(self.train_starts, size)
+        if len(self.own_starts):  # [D9]
+            own = rng.random(size) < self.config.own_share
+            starts[own] = rng.choice(self.own_starts, own.sum())
+        obs, actions = self.replay.sequences(starts, self.config.horizon + 1)
+        renew_targets(self.replay.header.get("task"), obs, self.config.new_targets, rng)
+        return perturbed_batch(self.expert, self.student, obs, actions, self.config, rng)
 
     def batch(self, t):
-        """Step t's part of its pool, which is gone through `reuse` times, in another order each."""
+        """Step t's part of its pool, which is gone through `reuse` times, in another order each:
+        features, perturbed actions and targets, as `perturbed_batch`."""
         size, reuse = self.config.batch_size, self.config.reuse
-        steps = reuse * self.pool_size // size  # that a pool lasts
-        number, i = divmod(t, steps)
+        number, i = divmod(t, reuse * self.pool_size // size)  # steps that a pool lasts
         if number != self._number:
-            ready = self._next if self._number == number - 1 else None
-            self._pool = ready.result() if ready else self.pool(number)
-            if t - i + steps < self.config.steps:
-                self._next = self._threads.submit(self.pool, number + 1)
+            sizes = np.diff(np.r_[0:self.pool_size:PART, self.pool_size])
+            features, actions, targets = zip(*self._threads.map(
+                self.draw, itertools.repeat(number), itertools.count(), sizes))
+            self._pool = (np.concatenate(features, 2), np.concatenate(actions, 2),
+                          [np.concatenate(target, 1) for target in zip(*targets)])
             rng, self._number = stream(self.seed, "order", number), number
             self._order = np.concatenate([rng.permutation(self.pool_size) for _ in range(reuse)])
         chosen = self._order[i * size:(i + 1) * size]
@@ -985,18 +877,15 @@ class Distiller:
         """Lines 4 to 6 once. Returns loss, mean reward divergence, mean value divergence."""
         features, actions, targets = self.batch(self.t)
 
-        def learn(learner, part):
-            arena, _, grads = learner
-            arena.rewind()
+        def learn(half, part):
             return distill_loss(self.student, features[..., part], actions[:, :, part],
-                                [x[:, part] for x in targets], self.config, grads, arena.empty)
+                                [x[:, part] for x in targets], self.config, half[1])
 
-        parts = np.array_split(np.arange(self.config.batch_size), len(self._learners))
-        parts = [part for part in parts if len(part)]
-        total = np.zeros(3)
-        for part, learner, losses in zip(parts, self._learners,
-                                         self._threads.map(learn, self._learners, parts)):
-            fraction, gradient = len(part) / self.config.batch_size, learner[1]
+        size, total = self.config.batch_size, np.zeros(3)
+        parts = [slice(0, -(-size // 2)), slice(-(-size // 2), size)][:size]
+        for part, (gradient, _), losses in zip(parts, self._halves,
+                                               self._threads.map(learn, self._halves, parts)):
+            fraction = (part.stop - part.start) / size
             total += fraction * np.array(losses)
             self.optimizer.gradient += gradient.dtype.type(fraction) * gradient
             gradient[:] = 0
@@ -1007,23 +896,18 @@ class Distiller:
         """Algorithm 1 from here to its end; yields the losses of each step.
 
         play: takes the number of episodes that the student is to play, and returns them as `add`
-        takes them; not needed without own episodes [D9].
-        """
+        takes them; not needed without own episodes [D9]."""
         while self.t < self.config.steps:
-            if self.episodes_due:
-                self.add(*play(self.episodes_due))
+            quarter = 4 * self.t // self.config.steps
+            due = quarter * self.config.own_episodes - self.episodes_played
+            if due:
+                self.add(*play(due))
             yield self.step()
 
     @property
     def t(self):
         """Steps made so far."""
-        return self.optimizer.adam.t
-
-    @property
-    def episodes_due(self):
-        """How many episodes the student is still to play before the next step [D9]."""
-        quarter = 4 * self.t // self.config.steps
-        return quarter * self.config.own_episodes - self.episodes_played
+        return self.optimizer.t
 
     @property
     def episodes_played(self):
@@ -1057,15 +941,6 @@ class Distiller:
         self._blas.restore_original_limits()
 
 
-def horizon_returns(rewards, q1, q2, discount):
-    """Equation 2 for every H at once, from `predict`'s global rewards and Q: G^0, ..., G^H.
-
-    All (L, B, K), K sequences in each state.
-    """
-    gamma = (discount ** np.arange(len(rewards))).astype(rewards.dtype)[:, None, None]
-    return np.cumsum(gamma * rewards, 0) - gamma * rewards + gamma * (q1 + q2) / 2
-
-
 def spearman(x, y):
     """Spearman's correlation over the last axis, where K values are ranked: (..., K) -> (...)."""
     from scipy.stats import rankdata
@@ -1074,13 +949,19 @@ def spearman(x, y):
     return (x * y).sum(-1) / np.maximum(norms, 1e-12)
 
 
+def horizon_returns(rewards, q1, q2, discount):
+    """Equation 2 for every H at once, from `predict`'s global rewards and Q: G^0, ..., G^H, all
+    (L, B, K), K sequences in each state."""
+    gamma = (discount ** np.arange(len(rewards))).astype(rewards.dtype)[:, None, None]
+    return np.cumsum(gamma * rewards, 0) - gamma * rewards + gamma * (q1 + q2) / 2
+
+
 def rank_correlation(distiller, states, seed, discount=0.99):
     """How alike student and expert order perturbed actions, which is what the loss asks for.
 
     Spearman's correlation over 32 action sequences, mean over `states` held-out states; 1 is the
     same order (section 4.4). Returns that of the global Q at each step h of the rollout, and that
-    of the global return G^H (Equation 2), which planning ranks by, for each H: two (L,).
-    """
+    of the global return G (Equation 2), by which planning ranks, for each H: two (L,)."""
     rng = stream(seed, "rank correlation")
     starts = rng.choice(distiller.held_out_starts, states)
     student, config = distiller.student, dataclasses.replace(distiller.config, noise_samples=32)
@@ -1093,9 +974,7 @@ def rank_correlation(distiller, states, seed, discount=0.99):
             spearman(*(horizon_returns(*out, discount) for out in (expert, own))).mean(-1))
 
 
-# ======================================================================================
-# 6. Planning: MPPI (Equations 2 and 3), then the worker processes
-# ======================================================================================
+# ==== 6. Planning: MPPI (Equations 2 and 3), then the worker processes ================
 
 
 def h_step_return(model, z, actions, config):
@@ -1104,8 +983,7 @@ def h_step_return(model, z, actions, config):
         G = sum_{h=0}^{H-1} gamma^h r(s_h, a_h) + gamma^H Q(s_H, a_H),   s_{h+1} = f_T(s_h, a_h)
 
     z (N, m, 1), actions (N, H + 1, d, S) -> G (N, S). Q is the mean of the two: unlike TD-MPC's
-    minimum, a mean of sums is the sum of means, as Proposition 1 needs [D4].
-    """
+    minimum, a mean of sums is the sum of means, as Proposition 1 needs [D4]."""
     gamma, G = config.discount, 0.0
     z = np.repeat(z, actions.shape[-1], axis=2)
     for h in range(config.horizon):
@@ -1122,8 +1000,7 @@ def mppi(returns, mean, config, rngs, proposals=None):
     one Generator for each agent; proposals (N, L, d, P): sequences that compete in every
     iteration. Elites are chosen agent by agent, which Proposition 1 allows: with N = 1 this is
     centralized MPPI. Returns the new mean (N, L, d), the last elites (N, L, d, E) and their
-    scores (N, E), which sum to 1.
-    """
+    scores (N, E), which sum to 1."""
     mean, std = mean[..., None], F32(config.max_std)
     if proposals is not None:
         G_proposals = returns(proposals)
@@ -1200,7 +1077,7 @@ class AgentPlanner:
         return np.stack(actions, 1)
 
 
-class Planner:
+class Planner(contextlib.AbstractContextManager):
     """Observation in, action out, with the warm start kept between decisions.
 
         with Planner(model, PlannerConfig(), seed=0, workers=1) as planner:
@@ -1209,32 +1086,15 @@ class Planner:
     workers: processes beside this one; each plans for a part of the agents (0: all here).
     Every agent owns its random stream and one BLAS thread computes each product, so the plan
     is the same, bit for bit, for every number of workers. Raises WorkerError when a worker
-    has died.
-    """
+    has died."""
 
     def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
-        sizes = model.config
-        self.model, n = model, sizes.num_agents
-        self._parts = split_agents(n, workers)
-        self._own = AgentPlanner(model.agents(0, self._parts[0].stop), config)
-        self._workers = self._z = self._actions = None
-        if len(self._parts) > 1:
-            context = multiprocessing.get_context("spawn")
-            # anonymous to the file system: nothing can be left behind, even after SIGKILL
-            raw = [context.RawArray("f", size) for size in (n * sizes.latent_dim, sizes.dim_action)]
-            self._z, self._actions = self._views(*raw, sizes)
-            self._workers = Workers(_planning_worker, len(self._parts) - 1, "planning worker",
-                                    (*raw, sizes))
-            for i, s in enumerate(self._parts[1:]):
-                self._workers.send(i, (model.agents(s.start, s.stop), config, s))
+        self.model, self._parts = model, split_agents(model.config.num_agents, workers)
+        self.own = AgentPlanner(model.agents(0, self._parts[0].stop), config)
+        self._workers = Workers(_planning_worker, workers, "planning worker")
+        for i, part in enumerate(self._parts[1:]):
+            self._workers.send(i, (model.agents(part.start, part.stop), config))
         self.reset(np.random.SeedSequence(seed).entropy)  # None: the system's own
-
-    @staticmethod
-    def _views(raw_z, raw_actions, sizes):
-        """The shared latents (N, m, 1) and actions (N, d) as arrays."""
-        n = sizes.num_agents
-        return (np.frombuffer(raw_z, F32).reshape(n, sizes.latent_dim, 1),
-                np.frombuffer(raw_actions, F32).reshape(n, sizes.agent_actions))
 
     def reset(self, seed=None):
         """Start an episode: forget the warm start; a seed also starts the random streams anew."""
@@ -1242,16 +1102,7 @@ class Planner:
         seeds = [] if seed is None else np.random.SeedSequence(seed).spawn(n)
         for i, part in enumerate(self._parts[1:]):
             self._workers.send(i, seeds[part])
-        self._own.reset(seeds[self._parts[0]])
-
-    @property
-    def warm_start(self):
-        """What an episode hands to its next decision, where all is planned in this process."""
-        return self._own.mean, self._own.rngs, self._own.t
-
-    @warm_start.setter
-    def warm_start(self, state):
-        self._own.mean, self._own.rngs, self._own.t = state
+        self.own.reset(seeds[self._parts[0]])
 
     def act(self, obs):
         """obs (O,), anything that converts to float32 -> action (A,) float32 in [-1, 1]."""
@@ -1263,28 +1114,19 @@ class Planner:
             raise UserError("observation: holds values that are not finite")
         with one_thread():
             z = self.model.encode(obs[:, None])
-            if not self._workers:
-                return self._own.plan(z).reshape(-1)
-            self._z[:] = z
-            self._workers.send_all("plan")
-            self._actions[self._parts[0]] = self._own.plan(np.ascontiguousarray(
-                z[self._parts[0]]))
-            self._workers.receive_all()
-            return self._actions.reshape(-1).copy()
+            for i, part in enumerate(self._parts[1:]):
+                self._workers.send(i, z[part])
+            own = self.own.plan(z[self._parts[0]])
+            return np.concatenate([own, *self._workers.receive_all()]).reshape(-1)
 
     def hand_over(self):
         """Wake all workers and wait for their answers, without planning: what `act` pays."""
-        if self._workers:
-            self._workers.send_all("hello")
-            self._workers.receive_all()
+        self._workers.send_all(None)
+        self._workers.receive_all()
 
     def close(self):
         """End the worker processes."""
-        if self._workers:
-            self._workers.close()
-
-    def __enter__(self):
-        return self
+        self._workers.close()
 
     def __exit__(self, *_):
         self.close()
@@ -1312,8 +1154,7 @@ class Returns:
     Layers are homogeneous matrices: a bias costs no pass over the activations, and the row of
     ones goes through ELU unchanged. Networks with the same input share its first product
     (dynamics with reward; both Q). The latent's part of that product is computed once a plan, as
-    all samples start from one latent. LayerNorm's mean and gain are folded into the weights.
-    """
+    all samples start from one latent. LayerNorm's mean and gain are folded into the weights."""
 
     def __init__(self, model):
         self.sizes, p = model.config, model.params
@@ -1326,16 +1167,14 @@ class Returns:
             for name, i in (*((name, 4) for name in step), *((name, 5) for name in both_q)))
         self.to_q = np.concatenate(to_q, 2) / 2                         # (N, 1, 2h + 2)
         # samples in a block: OpenBLAS is fastest on small matrices when the block fits the cache
-        self.block = 512 if model.config.mlp_dim >= 128 else 128
-        self._buffers = {}
+        self.block = 256 if model.config.mlp_dim >= 256 else 128
 
     def _fold_norm(self, p):
         """First layers of both Q, after which LayerNorm is y / sqrt(spread @ y^2 + eps) + shift.
 
         Centred rows give centred outputs, and rows times their gain outputs times theirs;
         `spread` takes the gains out of the variance again. The row of ones becomes zeros here,
-        and 20 by `shift`, which tanh takes to 1.
-        """
+        and 20 by `shift`, which tanh takes to 1."""
         rows = (self.sizes.num_agents, 2, self.sizes.mlp_dim + 1)
         W = side_by_side(p, ("_Q1", "_Q2"), 0).reshape(*rows, -1)
         W[:, :, -1] = 0
@@ -1360,67 +1199,41 @@ class Returns:
 
     def __call__(self, actions):
         """actions (N, L, d, S) -> G (N, S)."""
-        samples = actions.shape[-1]
-        width = -(-samples // max(1, round(samples / self.block)))  # blocks of equal width
-        total = np.zeros((len(actions), samples), F32)
-        for begin in range(0, samples, width):
-            part = slice(begin, min(begin + width, samples))
-            self._block(actions[..., part], total[:, part])
-        return total
+        blocks = max(1, round(actions.shape[-1] / self.block))
+        return np.concatenate([self._block(part) for part in
+                               np.array_split(actions, blocks, axis=-1)], 1)
 
-    def _make_buffers(self, width):
-        n, joint, hidden = (self.sizes.num_agents, self.sizes.latent_dim + self.sizes.agent_actions,
-                            2 * self.sizes.mlp_dim + 2)
-        return (np.ones((n, joint + 1, width), F32), np.empty((n, hidden, width), F32),
-                np.empty((n, hidden, width), F32), np.empty((n, 1, width), F32))
-
-    def _block(self, actions, total):
-        """Equation 2 for a block of samples; adds to total (N, width)."""
-        width, m, half = actions.shape[-1], self.sizes.latent_dim, self.sizes.mlp_dim + 1
-        if width not in self._buffers:
-            self._buffers[width] = self._make_buffers(width)
-        x, y, y2, out = self._buffers[width]                            # x is (z, a, 1)
+    def _block(self, actions):
+        """Equation 2 for a block of samples."""
+        m, half, G = self.sizes.latent_dim, self.sizes.mlp_dim + 1, F32(0)
+        x = np.ones((len(actions), m + actions.shape[2] + 1, actions.shape[-1]), F32)  # (z, a, 1)
         for h in range(self.horizon + 1):
             x[:, m:-1] = actions[:, h]
-            last = h == self.horizon
-            self._hidden(int(last), h, x, y, y2)
-            if last:
-                np.matmul(self.to_q, y2, out=out)
+            if h < self.horizon:
+                y = self._hidden(0, h, x)
+                out = self.to_reward @ y[:, half:]
+                np.matmul(self.to_latent, y[:, :half], out=x[:, :m])
             else:
-                np.matmul(self.to_reward, y2[:, half:], out=out)
-                np.matmul(self.to_latent, y2[:, :half], out=x[:, :m])
-            out *= self.discount ** h
-            total += out[:, 0]
+                out = self.to_q @ self._hidden(1, h, x)
+            G = G + F32(self.discount ** h) * out[:, 0]
+        return G
 
-    def _hidden(self, pair, h, x, y, y2):
+    def _hidden(self, pair, h, x):
         """Both hidden layers of a pair of networks (0: dynamics and reward, 1: the two Q)."""
-        if h == 0:
-            np.matmul(self.first_at_start[pair], x[:, self.sizes.latent_dim:], out=y)
-        else:
-            np.matmul(self.first[pair], x, out=y)
-        (_elu, self._norm_tanh)[pair](y, y2)
-        half = y.shape[1] // 2
+        y = (self.first[pair] @ x if h else
+             self.first_at_start[pair] @ x[:, self.sizes.latent_dim:])
+        y = self._norm_tanh(y) if pair else elu(y)
+        after, half = np.empty_like(y), y.shape[1] // 2
         for W, rows in zip(self.second[pair], (slice(0, half), slice(half, None))):
-            np.matmul(W, y[:, rows], out=y2[:, rows])
-        _elu(y2, y)
+            np.matmul(W, y[:, rows], out=after[:, rows])
+        return elu(after)
 
-    def _norm_tanh(self, y, work):
-        """tanh(LayerNorm(y)) of both Q in place, with a buffer."""
-        y, work = (b.reshape(*self.shift.shape[:3], -1) for b in (y, work))
-        np.multiply(y, y, out=work)
-        scale = self.spread @ work                                      # (N, 2, 1, S)
-        scale += F32(NORM_EPS)
-        np.sqrt(scale, out=scale)
-        y /= scale
+    def _norm_tanh(self, y):
+        """tanh(LayerNorm(y)) of both Q."""
+        shape, y = y.shape, y.reshape(*self.shift.shape[:3], -1)
+        y /= np.sqrt(self.spread @ (y * y) + F32(NORM_EPS))             # (N, 2, 1, S)
         y += self.shift
-        np.tanh(y, out=y)
-
-
-def _elu(y, work):
-    """`elu` in place, with a buffer."""
-    np.clip(y, -np.inf, 0, out=work)
-    np.expm1(work, out=work)
-    np.maximum(y, work, out=y)
+        return np.tanh(y, out=y).reshape(shape)
 
 
 # ---- The same, in processes: workers plan for a part of the agents each.
@@ -1447,36 +1260,32 @@ def useful_workers(agents):
     return min(agents, cores()) - 1
 
 
-def _planning_worker(connection, raw_z, raw_actions, sizes):
-    """Plans for its part of the agents when told to "plan"; a list is new random streams."""
-    z, actions = Planner._views(raw_z, raw_actions, sizes)
-    model, config, part = connection.recv()
-    planner, done = AgentPlanner(model, config), pickle.dumps(None)
+def _planning_worker(connection):
+    """Plans for its part of the agents: latents in, actions out; a list is new random streams."""
+    planner = AgentPlanner(*connection.recv())
     while True:
         message = connection.recv()
-        if message == "plan":
-            actions[part] = planner.plan(z[part].copy())
-        if isinstance(message, str):
-            connection.send_bytes(done)
-        else:
+        if isinstance(message, list):
             planner.reset(message)
+        else:
+            connection.send(None if message is None else planner.plan(message))
 
 
 class WorkerError(UserError):
     """A worker process died."""
 
 
-class Workers:
+class Workers(contextlib.AbstractContextManager):
     """`count` processes that each run target(connection, *shared).
 
     Spawned, since fork is unsafe once BLAS has threads; with one BLAS thread each; deaf to
     Ctrl-C, which ends the parent, whose closed pipes end them. Anything large is sent through
-    the connection: a process that dies at its start would block a parent that passes it.
-    """
+    the connection: a process that dies at its start would block a parent that passes it."""
 
     def __init__(self, target, count, name="worker", shared=()):
         context, self._name, self._members = multiprocessing.get_context("spawn"), name, []
-        with _child_environment():
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which a child inherits
+        try:
             for _ in range(count):
                 here, there = context.Pipe()
                 process = context.Process(target=_run_worker, args=(target, there, *shared),
@@ -1484,6 +1293,8 @@ class Workers:
                 process.start()
                 there.close()
                 self._members.append((process, here))
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
     def send(self, i, message):
         """Send to worker i."""
@@ -1496,10 +1307,13 @@ class Workers:
 
     def receive(self, i):
         """The next message of worker i; WorkerError as soon as it has died."""
+        process, connection = self._members[i]
         try:
-            message = self._members[i][1].recv()
+            message = connection.recv()
         except (EOFError, ConnectionResetError):
-            self._died(i)
+            process.join(1)
+            message = WorkerError(f"{self._name} {i} ended with exit code {process.exitcode}; "
+                                  f"the others were stopped")
         if isinstance(message, Exception):
             self.close()
             raise message
@@ -1514,19 +1328,6 @@ class Workers:
         """The next message of every worker, in their order."""
         return [self.receive(i) for i in range(len(self._members))]
 
-    def ready(self, timeout=None):
-        """Indices of workers with a message (or an end); waits for one, or `timeout` seconds."""
-        connections = [connection for _, connection in self._members]
-        return [connections.index(c)
-                for c in multiprocessing.connection.wait(connections, timeout)]
-
-    def _died(self, i):
-        process = self._members[i][0]
-        process.join(1)
-        self.close()
-        raise WorkerError(f"{self._name} {i} ended with exit code {process.exitcode}; the others "
-                          f"were stopped")
-
     def close(self):
         """End all processes: closed pipes first, then force."""
         for _, connection in self._members:
@@ -1537,29 +1338,8 @@ class Workers:
                 process.kill()
                 process.join()
 
-    def __enter__(self):
-        return self
-
     def __exit__(self, *_):
         self.close()
-
-
-@contextlib.contextmanager
-def _child_environment():
-    """Processes started in here get one BLAS thread and no SIGINT."""
-    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by the child
-    os.environ.update(dict.fromkeys(names, "1"))
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def _run_worker(target, connection, *arguments):
@@ -1585,27 +1365,18 @@ def one_thread():
     return _thread_pools().limit(limits=1, user_api="blas")
 
 
-# ======================================================================================
-# 7. Environments (appendix B.1)
-# ======================================================================================
+# ==== 7. Environments (appendix B.1) ==================================================
 
 # paper's name: (dm_control domain, task, dim O, dim A); the dimensions are Figure 3's
 TASKS = {
-    "reacher-easy": ("reacher", "easy", 8, 3),
-    "reacher-hard": ("reacher", "hard", 8, 3),
-    "hopper-hop": ("hopper", "hop", 15, 4),
-    "fish-swim": ("fish", "swim", 24, 5),
+    "reacher-easy": ("reacher", "easy", 8, 3), "reacher-hard": ("reacher", "hard", 8, 3),
+    "hopper-hop": ("hopper", "hop", 15, 4), "fish-swim": ("fish", "swim", 24, 5),
     "cheetah-run": ("cheetah", "run", 17, 6),
-    "walker-walk": ("walker", "walk", 24, 6),
-    "walker-run": ("walker", "run", 24, 6),
-    "quadruped-walk": ("quadruped", "walk", 78, 12),
-    "quadruped-run": ("quadruped", "run", 78, 12),
-    "humanoid-stand": ("humanoid", "stand", 67, 21),
-    "humanoid-walk": ("humanoid", "walk", 67, 21),
-}
+    "walker-walk": ("walker", "walk", 24, 6), "walker-run": ("walker", "run", 24, 6),
+    "quadruped-walk": ("quadruped", "walk", 78, 12), "quadruped-run": ("quadruped", "run", 78, 12),
+    "humanoid-stand": ("humanoid", "stand", 67, 21), "humanoid-walk": ("humanoid", "walk", 67, 21)}
 REACHER_TARGET = {"easy": 0.05, "hard": 0.015}  # radius of the target, metres
-FINGER_RADIUS = 0.01
-REACHER_LINK = 0.09
+FINGER_RADIUS, REACHER_LINK = 0.01, 0.09
 
 # dm_control's reacher has two links; the paper's has three. Three links of 9 cm, the two
 # inner joints stop at 80 degrees, nothing collides, the task is the two-link one's.
@@ -1616,7 +1387,9 @@ REACHER_XML = f"""
   <default>
     <joint type="hinge" axis="0 0 1" damping="0.01"/>
     <motor gear="0.05" ctrlrange="-1 1" ctrllimited="true"/>
-    <default class="link"><geom type="capsule" size="0.01" rgba="0.7 0.5 0.3 1"/></default>
+    <default class="link">
+      <geom type="capsule" size="0.01" rgba="0.7 0.5 0.3 1" fromto="0 0 0 {REACHER_LINK} 0 0"/>
+    </default>
   </default>
   <worldbody>
     <light pos="0 0 1"/>
@@ -1624,11 +1397,9 @@ REACHER_XML = f"""
     <geom name="ground" type="plane" size="0.3 0.3 10" rgba="0.2 0.3 0.4 1"/>
     <geom name="target" type="sphere" pos="0 0 0.01" size="0.05" rgba="0.8 0.2 0.2 1"/>
     <body name="arm0" pos="0 0 0.01">
-      <joint name="joint0"/>
-      <geom name="arm0" class="link" fromto="0 0 0 {REACHER_LINK} 0 0"/>
+      <joint name="joint0"/> <geom name="arm0" class="link"/>
       <body name="arm1" pos="{REACHER_LINK} 0 0">
-        <joint name="joint1" limited="true" range="-80 80"/>
-        <geom name="arm1" class="link" fromto="0 0 0 {REACHER_LINK} 0 0"/>
+        <joint name="joint1" limited="true" range="-80 80"/> <geom name="arm1" class="link"/>
         <body name="hand" pos="{REACHER_LINK} 0 0">
           <joint name="joint2" limited="true" range="-80 80"/>
           <geom name="hand" class="link" fromto="0 0 0 0.1 0 0"/>
@@ -1653,8 +1424,7 @@ class Environment:
 
     Observations are dm_control's dict, concatenated in its own order, float32 (dim O,).
     Actions (dim A,) in [-1, 1] are scaled to the action spec and applied ACTION_REPEAT times.
-    Raises UserError for an unknown task or an installation that dm_control can't work with.
-    """
+    Raises UserError for an unknown task or an installation that dm_control can't work with."""
 
     def __init__(self, task):
         domain, name, self.dim_obs, self.dim_action = lookup_task(task)
@@ -1715,20 +1485,6 @@ def training_seeds(seed, use, first, count):
     return [int(stream(seed, use, i).integers(2 ** 31)) for i in range(first, first + count)]
 
 
-def move_target(obs, reward, back, chosen, task):
-    """Move the target of reacher segments back by `back` (B, 2) where chosen (B,), in place.
-
-    The observation is (3 joints, 2 finger-to-target, 3 velocities) and the dynamics don't know
-    the target, so this gives a true segment of an episode with another target; `back` = a later
-    step's finger-to-target puts it where the finger is then. obs (H+1, B, 8), reward (H, B): the
-    new one is that of the decision's end for all its repeated actions.
-    """
-    radius = REACHER_TARGET[lookup_task(task)[1]] + FINGER_RADIUS
-    obs[:, chosen, 3:5] -= back[chosen]
-    distance = np.linalg.norm(obs[1:, chosen, 3:5], axis=-1)
-    reward[:, chosen] = ACTION_REPEAT * (distance <= radius)
-
-
 def draw_targets(obs, rng):
     """Finger-to-target (2, B) of reacher states (8, B) for targets drawn as the task draws them."""
     heading = np.cumsum(obs[:3], 0)
@@ -1737,9 +1493,14 @@ def draw_targets(obs, rng):
     return radius * np.stack([np.cos(angle), np.sin(angle)]) - finger
 
 
-# ======================================================================================
-# 8. Files: weights, replay, replay buffer
-# ======================================================================================
+def renew_targets(task, obs, share, rng):
+    """Draw the targets of a share of reacher's states (8, B) anew, in place [D7]."""
+    if str(task).startswith("reacher"):
+        chosen = rng.random(obs.shape[1]) < share
+        obs[3:5, chosen] = draw_targets(obs[:, chosen], rng)
+
+
+# ==== 8. Files: weights, replay, replay buffer ========================================
 
 DATA = Path(__file__).resolve().parent / "data"
 FORMAT = "fac-tdmpc-ref 1"
@@ -1747,21 +1508,18 @@ FORMAT = "fac-tdmpc-ref 1"
 
 @contextlib.contextmanager
 def atomic_file(path, mode="wb", **options):
-    """A file that appears under its name only when it is complete; UserError if it can't."""
+    """A file that appears under its name, in a folder made for it, only when it is complete."""
     path, temporary = Path(path), None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(prefix=path.name, suffix=".tmp", dir=path.parent)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(prefix=path.name, suffix=".tmp", dir=path.parent)
         with os.fdopen(handle, mode, **options) as file:
             yield file
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
-    except OSError as error:
-        raise UserError(f"{path}: can't be written: {error.strerror or error}") from error
     finally:
-        if temporary:
-            with contextlib.suppress(FileNotFoundError):
-                os.unlink(temporary)
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(temporary)
 
 
 def write_npz(path, header, arrays, compress=False):
@@ -1798,21 +1556,13 @@ def read_npz(path, kind):
     return header, arrays
 
 
-def digest(array):
-    """What golden files keep of a large array: norm, product with a unit vector, 64 entries."""
-    flat = np.asarray(array, np.float64).ravel()
-    fixed = np.cos(np.arange(flat.size, dtype=np.float64) ** 2 % 1009)
-    entries = flat[np.linspace(0, flat.size - 1, 64).astype(int)]
-    return np.r_[np.linalg.norm(flat), flat @ fixed / np.linalg.norm(fixed), entries]
-
-
 def save_model(path, model, header):
     """Weights under TD-MPC's names; torch shapes where N = 1, else with a leading agent axis."""
     arrays = {}
     for key, value in model.params.items():
         value = value[..., 0] if key.endswith("bias") or key.split(".")[1] == "1" else value
         arrays[key] = value[0] if len(value) == 1 else value
-    write_npz(path, {**header, "model": dataclasses.asdict(model.config)}, arrays)
+    write_npz(path, {**header, "model": asdict(model.config)}, arrays)
 
 
 def load_model(path):
@@ -1831,13 +1581,18 @@ def load_model(path):
             if value.shape != on_disk or value.dtype != F32:
                 raise UserError(f"{path}: {key}: expected float32 {on_disk}, found {value.dtype} "
                                 f"{value.shape}; the header's sizes and the weights disagree")
-            if not np.isfinite(value).all():
-                raise UserError(f"{path}: {key}: holds values that are not finite")
+            check_values(value, path, key)
             params[key] = np.ascontiguousarray(value.reshape(expected))
     if arrays:
         raise UserError(f"{path}: {next(iter(arrays))}: unknown entry; expected "
                         f"TD-MPC's state-dict names only")
     return WorldModel(config, params), header
+
+
+def check_values(array, path, key):
+    """UserError if a file's array holds values that are not finite."""
+    if not np.isfinite(array).all():
+        raise UserError(f"{path}: {key}: holds values that are not finite")
 
 
 def trained_discount(header, where):
@@ -1854,8 +1609,7 @@ class Replay:
     """The dataset of Algorithm 1: transitions in order, episode after episode.
 
     observation (M, O) and action (M, A) float16, continues (M,): False in an episode's last
-    row, whose action stands for nothing. Raises UserError for anything else.
-    """
+    row, whose action stands for nothing. Raises UserError for anything else."""
 
     def __init__(self, path):
         self.path = path
@@ -1868,8 +1622,7 @@ class Replay:
                 found = "nothing" if value is None else f"{value.dtype} {value.shape}"
                 raise UserError(f"{path}: {key}: expected {dtype.__name__} of rank {rank} with a "
                                 f"row for each transition, found {found}")
-            if not np.isfinite(value).all():
-                raise UserError(f"{path}: {key}: holds values that are not finite")
+            check_values(value, path, key)
         self.observation, self.action = arrays["observation"], arrays["action"]
         self.ends = np.flatnonzero(~arrays["continues"])
         self.dim_obs, self.dim_action = self.observation.shape[1], self.action.shape[1]
@@ -1889,8 +1642,7 @@ class Replay:
     def starts(self, steps, held_out):
         """Rows from which `steps` actions stay in their episode: (training, held-out) rows.
 
-        Every (1 / held_out)-th episode is held out, so that all of the expert's training counts.
-        """
+        Every (1 / held_out)-th episode is held out, so that all of the expert's training counts."""
         every = max(2, round(1 / held_out))
         training, held = [], []
         for i, (begin, end) in enumerate(zip(np.r_[0, self.ends + 1], self.ends)):
@@ -1905,66 +1657,6 @@ class Replay:
         obs = self.observation[starts].T.astype(F32)
         actions = self.action[starts + np.arange(steps)[:, None]]
         return obs, actions.swapaxes(1, 2).astype(F32)
-
-
-class ReplayBuffer:
-    """Whole episodes in fixed memory, to learn from; the oldest go when it is full.
-
-    observation (E, T + 1, O), action (E, T, A), reward (E, T) with T = EPISODE_STEPS; capacity in
-    transitions; `count` episodes have been added so far.
-    """
-
-    def __init__(self, dim_obs, dim_action, capacity, dtype=F32):
-        episodes, self.count = max(1, capacity // EPISODE_STEPS), 0
-        self.observation = np.zeros((episodes, EPISODE_STEPS + 1, dim_obs), dtype)
-        self.action = np.zeros((episodes, EPISODE_STEPS, dim_action), dtype)
-        self.reward = np.zeros((episodes, EPISODE_STEPS), F32)
-
-    def __len__(self):
-        """Episodes held."""
-        return min(self.count, len(self.reward))
-
-    def add(self, observation, action, reward):
-        """Add an episode: (T + 1, O), (T, A), (T,)."""
-        i = self.count % len(self.reward)
-        self.observation[i], self.action[i], self.reward[i] = observation, action, reward
-        self.count += 1
-
-    def state(self):
-        """The episodes held, as arrays; `load` takes them back."""
-        n = len(self)
-        return {"observation": self.observation[:n], "action": self.action[:n],
-                "reward": self.reward[:n], "count": np.int64(self.count)}
-
-    def load(self, state):
-        """Hold what a `state` holds."""
-        n, self.count = len(state["reward"]), int(state["count"])
-        self.observation[:n], self.action[:n], self.reward[:n] = (
-            state[k] for k in ("observation", "action", "reward"))
-
-    def sample(self, rng, batch, steps):
-        """Segments drawn evenly, float32: observations (H + 1, O, B), actions (H, A, B), rewards
-        (H, B), and where they begin: episodes and steps, (B,) each."""
-        episode = rng.integers(len(self), size=batch)
-        start = rng.integers(EPISODE_STEPS - steps + 1, size=batch)
-        rows = start + np.arange(steps + 1)[:, None]
-        obs = self.observation[episode, rows].astype(F32)
-        action = self.action[episode, rows[:-1]].astype(F32)
-        reward = self.reward[episode, rows[:-1]]
-        return obs.swapaxes(1, 2), action.swapaxes(1, 2), reward, (episode, start)
-
-    def write(self, path, header):
-        """A file for `Replay`: oldest episode first; an episode's last row has no action."""
-        order = np.arange(self.count - len(self), self.count) % len(self.reward)
-        action = np.zeros((len(order), EPISODE_STEPS + 1, self.action.shape[2]), np.float16)
-        action[:, :-1] = self.action[order]
-        continues = np.ones(action.shape[:2], bool)
-        continues[:, -1] = False
-        write_npz(path, {"kind": "replay", **header}, {
-            "observation": self.observation[order].reshape(-1, self.observation.shape[2])
-            .astype(np.float16),
-            "action": action.reshape(-1, action.shape[2]), "continues": continues.ravel()},
-            compress=True)
 
 
 def checksum(arrays):
@@ -1985,36 +1677,73 @@ def data_file(task, name):
     return path
 
 
-# ======================================================================================
-# 9. Commands
-# ======================================================================================
+# ==== 9. Commands =====================================================================
 
 
-def run_episode(environment, planner, seed):
-    """Plan through the episode of `seed`; yields each decision's (observation, action, reward,
-    seconds of planning)."""
-    planner.reset(seed)
-    obs = environment.reset(seed)
-    for _ in range(EPISODE_STEPS):
-        begin = time.perf_counter()
-        action = planner.act(obs)
-        seconds = time.perf_counter() - begin
-        after, reward = environment.step(action)
-        yield obs, action, reward, seconds
-        obs = after
-
-
-def _evaluation_worker(connection):
-    """Runs the episodes whose seeds arrive; reports every 25 decisions."""
-    model, task, config = connection.recv()
+def decisions(model, task, config, seeds):
+    """Plan through the episode of each seed; yields every decision's observation (O,), action
+    (A,), reward and seconds of planning."""
     environment, planner = Environment(task), Planner(model, config)
-    while True:
-        part = []
-        for decision in run_episode(environment, planner, connection.recv()):
-            part.append(decision)
-            if len(part) == 25:
-                connection.send(part)
-                part = []
+    for seed in seeds:
+        planner.reset(seed)
+        obs = environment.reset(seed)
+        for _ in range(EPISODE_STEPS):
+            begin = time.perf_counter()
+            action = planner.act(obs)
+            seconds = time.perf_counter() - begin
+            after, reward = environment.step(action)
+            yield obs, action, reward, seconds
+            obs = after
+
+
+def _playing_worker(connection):
+    """Sends the decisions of its episodes, 25 at a time."""
+    played = decisions(*connection.recv())
+    while part := list(itertools.islice(played, 25)):
+        connection.send(part)
+    connection.recv()  # until the pipe is closed
+
+
+def play(model, task, config, seeds, workers=None, label="playing"):
+    """Plan through the episodes of `seeds`: observations (E, T, O), actions (E, T, A), rewards
+    (E, T) and seconds of planning (E, T), with T = EPISODE_STEPS.
+
+    workers: processes that share the episodes [one for each core]; 0: all in this one. An episode
+    depends on its seed alone, so that number changes nothing."""
+    workers = min(cores() if workers is None else workers, len(seeds))
+    parts = [seeds[w::workers or 1] for w in range(workers or 1)]
+    here, played = decisions(model, task, config, seeds), [[] for _ in parts]
+    with progress(label, len(seeds) * EPISODE_STEPS, "decision") as bar, \
+            Workers(_playing_worker, workers, "evaluation worker") as pool:
+        for w in range(workers):
+            pool.send(w, (model, task, config, parts[w]))
+        while bar.n < bar.total:
+            for w, found in enumerate(played):
+                if len(found) < len(parts[w]) * EPISODE_STEPS:
+                    found += pool.receive(w) if workers else itertools.islice(here, 25)
+            bar.update(sum(map(len, played)) - bar.n)
+            mean = EPISODE_STEPS / bar.n * sum(reward for f in played for _, _, reward, _ in f)
+            bar.set_postfix_str(f"mean return so far about {mean:.0f}", False)
+    episodes = [None] * len(seeds)
+    for w, found in enumerate(played):
+        episodes[w::len(parts)] = [found[t:t + EPISODE_STEPS]
+                                   for t in range(0, len(found), EPISODE_STEPS)]
+    return tuple(np.array([list(column) for column in columns])
+                 for columns in zip(*(zip(*episode) for episode in episodes)))
+
+
+def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="evaluating"):
+    """Returns of `episodes` episodes, played side by side in `workers` processes (see `play`).
+
+    Gives {"returns", "seed", "planner" (its settings), "plan_ms_median" (of the episodes' mean
+    decisions)}. Raises UserError if the model isn't for the task."""
+    check_task(model.config, task)
+    if episodes < 1:
+        raise UserError(f"episodes must be at least 1, not {episodes}")
+    _, _, rewards, seconds = play(model, task, config, episode_seeds(seed, episodes), workers,
+                                  label)
+    return {"returns": rewards.sum(1).tolist(), "seed": seed, "planner": asdict(config),
+            "plan_ms_median": 1e3 * float(np.median(seconds.mean(1)))}
 
 
 def check_task(sizes, task):
@@ -2023,66 +1752,6 @@ def check_task(sizes, task):
     if dims != [sizes.dim_obs, sizes.dim_action]:
         raise UserError(f"the model has (dim O, dim A) = ({sizes.dim_obs}, {sizes.dim_action}), "
                         f"{task} has ({dims[0]}, {dims[1]}); name the task it was made for")
-
-
-def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="evaluating"):
-    """Returns of `episodes` episodes, run side by side in `workers` processes (0: in this one).
-
-    Gives {"returns", "seeds", "seed", "planner" (its settings), "plan_ms_median" (of the episodes'
-    mean decisions)}.
-    An episode depends on its seed alone, so the returns are the same for every number of workers.
-    """
-    check_task(model.config, task)
-    if episodes < 1:
-        raise UserError(f"episodes must be at least 1, not {episodes}")
-    seeds = episode_seeds(seed, episodes)
-    workers = worker_count(workers, episodes)
-    rewards, seconds = np.zeros((episodes, EPISODE_STEPS)), np.zeros(episodes)
-    with progress(label, episodes * EPISODE_STEPS, "decision") as bar:
-        for i, t, part in _decisions(model, task, config, seeds, workers):
-            rewards[i, t:t + len(part)] = [reward for *_, reward, _ in part]
-            seconds[i] += sum(s for *_, s in part)
-            bar.update(len(part))
-            if bar.n >= EPISODE_STEPS:
-                bar.set_postfix_str(f"mean return so far about "
-                                    f"{rewards.sum() * EPISODE_STEPS / bar.n:.0f}", False)
-    returns = rewards.sum(1)  # here, so that the parts' sizes don't matter
-    return {"returns": [float(r) for r in returns], "seeds": seeds, "seed": seed,
-            "planner": dataclasses.asdict(config),
-            "plan_ms_median": 1e3 / EPISODE_STEPS * float(np.median(seconds))}
-
-
-def worker_count(workers, episodes):
-    """As many processes as asked for, or as there are cores, but no more than episodes."""
-    return min(cores() if workers is None else workers, episodes)
-
-
-def _decisions(model, task, config, seeds, workers):
-    """Yields (episode, t, its decisions from t on, as `run_episode` gives them) until all end."""
-    if workers < 1:
-        environment, planner = Environment(task), Planner(model, config)
-        for i, seed in enumerate(seeds):
-            for t, decision in enumerate(run_episode(environment, planner, seed)):
-                yield i, t, [decision]
-        return
-    waiting, running, left = list(enumerate(seeds)), {}, {}
-    with Workers(_evaluation_worker, workers, "evaluation worker") as pool:
-        ready = range(workers)
-        for w in ready:
-            pool.send(w, (model, task, config))
-        while True:
-            for w in ready:
-                if w in running:
-                    part, t = pool.receive(w), EPISODE_STEPS - left[w]
-                    left[w] -= len(part)
-                    yield running[w], t, part
-                if not left.get(w) and waiting:
-                    running[w], episode_seed = waiting.pop(0)
-                    left[w] = EPISODE_STEPS
-                    pool.send(w, episode_seed)
-            if not any(left.values()):
-                return
-            ready = pool.ready()
 
 
 def progress(label, total, unit, initial=0):
@@ -2097,23 +1766,64 @@ def interleaved_seconds(calls, rounds, label):
     """Seconds of functions that are called one after the other, again and again: (rounds, calls).
 
     So noise hits all alike. BLAS has one thread meanwhile: idle ones would keep a core from the
-    worker processes. A round before the first makes buffers and isn't counted.
-    """
-    seconds = np.zeros((rounds, len(calls)))
-    with one_thread(), progress(label, rounds, "round") as bar:
-        for call in calls:
-            call()
+    worker processes. A round before the first isn't counted."""
+    seconds = np.zeros((rounds + 1, len(calls)))
+    with one_thread(), progress(label, rounds + 1, "round") as bar:
         for row in seconds:
             for i, call in enumerate(calls):
                 begin = time.perf_counter()
                 call()
                 row[i] = time.perf_counter() - begin
             bar.update()
-    return seconds
+    return seconds[1:]
 
 
 CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correlation_h0",
          "rank_correlation_last", "rank_correlation_return")
+
+
+def train_student(distiller, out, settings, playing, workers):
+    """Algorithm 1 to its end, with a learning curve and checkpoints in `out`.
+
+    A run that was cut off goes on from its checkpoint and ends as if it had not been. Returns
+    (curve rows, seconds). playing, workers: the planner and the processes of the student's own
+    episodes [D9]."""
+    def play_own(count):
+        seeds = training_seeds(distiller.seed, "own episode", distiller.episodes_played, count)
+        return play(distiller.student, settings["task"], playing, seeds, workers,
+                    "the student plays")[:2]
+
+    checkpoint, config, curve, before = out / "checkpoint.npz", distiller.config, [], 0.0
+    if checkpoint.exists():
+        header, arrays = read_npz(checkpoint, ("checkpoint",))
+        same_settings(header["settings"], settings, checkpoint)
+        curve, before = header["curve"], header["seconds"]
+        distiller.load(arrays)
+    began = saved = time.time()
+    every, losses = max(1, min(250, config.steps // 8)), []
+    with progress("distilling", config.steps, "step", distiller.t) as bar:
+        for found in distiller.run(play_own):
+            losses.append(found)
+            check_finite({"loss is": found}, distiller.t, config.lr)
+            bar.update()
+            if distiller.t % every and distiller.t < config.steps:
+                continue
+            means, losses = np.mean(losses, 0).tolist(), []
+            rank, returns = rank_correlation(distiller, 64, distiller.seed)
+            check_finite({"weights are": distiller.optimizer.vector,
+                          "student's predictions are": rank}, distiller.t, config.lr)
+            seconds = before + time.time() - began
+            curve.append([distiller.t, round(seconds, 2), *means,
+                          learning_rate(config, distiller.t - 1), float(rank[0]), float(rank[-1]),
+                          float(returns[-1])])
+            bar.set_postfix_str("loss {:.4f} KL reward {:.4f} value {:.4f} rank {:.3f}".format(
+                *means, returns[-1]), False)
+            write_curve(out / "curve.csv", CURVE, curve)
+            if time.time() - saved > 30 or distiller.t == config.steps:
+                write_npz(checkpoint, {"kind": "checkpoint", "settings": settings, "curve": curve,
+                                       "seconds": seconds}, distiller.state())
+                saved = time.time()
+    return curve, before + time.time() - began
 
 
 def check_finite(values, update, lr):
@@ -2124,75 +1834,16 @@ def check_finite(values, update, lr):
                             f"diverged; lower the learning rate ({lr})")
 
 
-def own_episodes(distiller, task, playing, workers, count):
-    """Episodes that the student plays, as `Distiller.add` takes them [D9]."""
-    sizes = distiller.student.config
-    observation = np.zeros((count, EPISODE_STEPS, sizes.dim_obs), np.float16)
-    action = np.zeros((count, EPISODE_STEPS, sizes.dim_action), np.float16)
-    seeds = training_seeds(distiller.seed, "own episode", distiller.episodes_played, count)
-    with progress("the student plays", count * EPISODE_STEPS, "decision") as bar:
-        for i, t, part in _decisions(distiller.student, task, playing, seeds,
-                                     worker_count(workers, count)):
-            observation[i, t:t + len(part)] = [obs for obs, *_ in part]
-            action[i, t:t + len(part)] = [act for _, act, *_ in part]
-            bar.update(len(part))
-    return observation, action
-
-
-def train_student(distiller, out, settings, playing, workers):
-    """Algorithm 1 to its end, with a learning curve and checkpoints in `out`.
-
-    A run that was cut off goes on from its checkpoint and ends as if it had not been. Returns
-    (curve rows, seconds). playing, workers: the planner and the processes of the student's own
-    episodes [D9].
-    """
-    checkpoint, config = out / "checkpoint.npz", distiller.config
-    curve, before = [], 0.0
-    if checkpoint.exists():
-        header, arrays = read_npz(checkpoint, ("checkpoint",))
-        same_settings(header["settings"], settings, checkpoint)
-        curve, before = header["curve"], header["seconds"]
-        distiller.load(arrays)
-    began = saved = time.time()
-    every = max(1, min(250, config.steps // 8))
-    losses = []
-    play = functools.partial(own_episodes, distiller, settings["task"], playing, workers)
-    with progress("distilling", config.steps, "step", distiller.t) as bar:
-        for found in distiller.run(play):
-            losses.append(found)
-            check_finite({"loss is": found}, distiller.t, config.lr)
-            bar.update()
-            if distiller.t % every == 0 or distiller.t == config.steps:
-                loss, kl_reward, kl_value = np.mean(losses, 0)
-                losses, seconds = [], before + time.time() - began
-                rank, returns = rank_correlation(distiller, 64, distiller.seed)
-                check_finite({"weights are": distiller.optimizer.vector,
-                              "student's predictions are": rank}, distiller.t, config.lr)
-                curve.append([distiller.t, round(seconds, 2), float(loss), float(kl_reward),
-                              float(kl_value), learning_rate(config, distiller.t - 1),
-                              float(rank[0]), float(rank[-1]), float(returns[-1])])
-                bar.set_postfix_str(f"loss {loss:.4f} KL reward {kl_reward:.4f} value "
-                                    f"{kl_value:.4f} rank {returns[-1]:.3f}", False)
-                write_curve(out / "curve.csv", CURVE, curve)
-                if time.time() - saved > 30 or distiller.t == config.steps:
-                    write_npz(checkpoint, {"kind": "checkpoint", "settings": settings,
-                                           "curve": curve, "seconds": seconds}, distiller.state())
-                    saved = time.time()
-    return curve, before + time.time() - began
-
-
 def same_settings(found, expected, where):
-    """UserError if a checkpoint was made with other settings (dicts, one level deep)."""
-    def flat(settings):
-        return {(group, key): value for group, part in settings.items()
-                for key, value in (part if isinstance(part, dict) else {group: part}).items()}
-
-    found, expected = flat(found), flat(expected)
+    """UserError if a checkpoint was made with other settings (dicts, whose values may be dicts)."""
     for key in {**found, **expected}:
-        if found.get(key) != expected.get(key):
-            raise UserError(f"{where}: an unfinished run with other settings ({key[1]}: expected "
-                            f"{expected.get(key)}, found {found.get(key)}); finish it with its "
-                            f"own, delete it, or choose another --out")
+        values = found.get(key), expected.get(key)
+        if all(isinstance(value, dict) for value in values):
+            same_settings(*values, where)
+        elif values[0] != values[1]:
+            raise UserError(f"{where}: an unfinished run with other settings ({key}: expected "
+                            f"{values[1]}, found {values[0]}); finish it with its own, delete it, "
+                            f"or choose another --out")
 
 
 def write_curve(path, columns, rows):
@@ -2201,6 +1852,12 @@ def write_curve(path, columns, rows):
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in row] for row in rows)
+
+
+def write_json(path, found):
+    """A dict or list as a JSON file."""
+    with atomic_file(path, "w") as file:
+        json.dump(found, file, indent=1)
 
 
 def pyplot():
@@ -2228,61 +1885,51 @@ def draw_curve(path, curve, title):
     except UserError:
         return False
     columns = dict(zip(CURVE, np.array(curve).T))
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-    for key, label in (("kl_reward", "rewards"), ("kl_value", "values")):
-        left.semilogy(columns["step"], columns[key], label=label)
-    left.set(xlabel="gradient step", ylabel="KL divergence", title=title)
-    for key, label in (("rank_correlation_h0", "Q, h = 0"), ("rank_correlation_last", "Q, h = H"),
-                       ("rank_correlation_return", "return G")):
-        right.plot(columns["step"], columns[key], label=label)
-    right.set(xlabel="gradient step", ylabel="rank correlation",
-              title="held-out states", ylim=(None, 1))
-    for axes in (left, right):
-        axes.legend()
-        axes.grid(alpha=0.3)
+    figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+    labels = ({"kl_reward": "rewards", "kl_value": "values"},
+              {"rank_correlation_h0": "Q, h = 0", "rank_correlation_last": "Q, h = H",
+               "rank_correlation_return": "return G"})
+    for ax, lines in zip(axes, labels):
+        for key, label in lines.items():
+            ax.plot(columns["step"], columns[key], label=label)
+        ax.set(xlabel="gradient step", title=title)
+        ax.legend()
+        ax.grid(alpha=0.3)
+    axes[0].set(yscale="log", ylabel="KL divergence")
+    axes[1].set(ylim=(None, 1), ylabel="rank correlation", title="held-out states")
     save_figure(path, figure)
     return True
 
 
 def read_records(path):
-    """The evaluations that were recorded for a model: those in the .json file beside it."""
+    """The returns recorded for a model's file, in the .json file beside it: a list of dicts."""
     path = Path(path).with_suffix(".json")
     try:
         records = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
-        if not all({"planner", "seed", "seeds", "returns", "weights"} <= set(r) for r in records):
-            raise ValueError("an entry lacks a key")
-    except (OSError, ValueError, TypeError) as error:
-        raise UserError(f"{path}: not a file that evaluate --record wrote ({error}); delete it and "
-                        f"record anew") from None
+        for record in records:
+            record["planner"], record["seed"], record["returns"], record["weights"]
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise UserError(f"{path}: not a file that evaluate --record wrote ({error!r}); delete it "
+                        f"and record anew") from None
     return records
 
 
 def record_returns(path, model, found):
     """Keep what `evaluate` found beside the model's file, one entry for planner and seed."""
-    record = {k: found[k] for k in ("planner", "seed", "seeds", "returns")}
     others = [r for r in read_records(path)
-              if (r["planner"], r["seed"]) != (record["planner"], record["seed"])]
-    with atomic_file(Path(path).with_suffix(".json"), "w") as file:
-        json.dump([*others, {**record, "weights": checksum(model.params.values())}], file, indent=1)
+              if (r["planner"], r["seed"]) != (found["planner"], found["seed"])]
+    record = {key: found[key] for key in ("planner", "seed", "returns")}
+    write_json(Path(path).with_suffix(".json"),
+               [*others, {**record, "weights": checksum(model.params.values())}])
 
 
-def recorded_returns(path, model, config, seeds):
+def recorded_returns(path, model, config, seed, episodes):
     """The recorded returns of a model with these weights, planner and episodes, or None."""
-    for record in read_records(path):
-        if (record["planner"] == dataclasses.asdict(config)
-                and record["seeds"][:len(seeds)] == seeds
-                and record["weights"] == checksum(model.params.values())):
-            return record["returns"][:len(seeds)]
+    wanted = asdict(config), seed, checksum(model.params.values())
+    for r in read_records(path):
+        if (r["planner"], r["seed"], r["weights"]) == wanted and len(r["returns"]) >= episodes:
+            return r["returns"][:episodes]
     return None
-
-
-def output_folder(path):
-    """The folder, made if it wasn't there; UserError if it can't be."""
-    try:
-        Path(path).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{path}: can't be written: {error.strerror}") from None
-    return Path(path)
 
 
 def command_distill(args):
@@ -2292,13 +1939,10 @@ def command_distill(args):
     config = from_args(DistillConfig, args, **preset(DistillConfig))
     made_for = {**preset(PlannerConfig), "horizon": config.horizon}
     from_args(PlannerConfig, args, **made_for)  # wrong settings first, then wrong files
-    lookup_task(args.task)
-    if args.episodes < 1:
-        raise UserError(f"episodes must be at least 1, not {args.episodes}")
-    expert, header, replay, where = load_data(args)
-    made_for["discount"] = trained_discount(header, where)
-    planning = from_args(PlannerConfig, args, **made_for)
-    out = output_folder(args.out or f"runs/{args.task}-{args.seed}")
+    expert, header, replay, path = load_data(args)
+    planning = from_args(PlannerConfig, args, discount=trained_discount(header, path), **made_for)
+    out = Path(args.out or f"runs/{args.task}-{args.seed}")
+    out.mkdir(parents=True, exist_ok=True)
     with contextlib.closing(Distiller(expert, replay, config, args.num_agents,
                                       args.seed)) as distiller:
         agents = distiller.student.config.num_agents
@@ -2306,12 +1950,11 @@ def command_distill(args):
         split_agents(agents, beside)  # refuses too many
         result = distil(distiller, args, planning, header, out)
     obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
-    result.update(evaluate_both(expert, where, distiller.student, args, planning, config.q_alone))
+    result.update(evaluate_both(expert, path, distiller.student, args, planning, config.q_alone))
     result.update(time_both(expert, distiller.student, planning, obs, beside,
                             keep=args.plan_workers is not None))
     result["seconds_total"] = round(time.time() - began, 1)
-    with atomic_file(out / "result.json", "w") as file:
-        json.dump(result, file, indent=1)
+    write_json(out / "result.json", result)
     (out / "checkpoint.npz").unlink(missing_ok=True)
     report(result, planning, args.eval_seed)
     return result
@@ -2319,6 +1962,7 @@ def command_distill(args):
 
 def load_data(args):
     """(expert, its header, replay, the expert's path) that distill's arguments name."""
+    lookup_task(args.task)
     if args.expert and os.path.isdir(args.expert):  # as train_expert.py and data/TASK hold them
         args.replay = args.replay or Path(args.expert) / "replay.npz"
         args.expert = Path(args.expert) / "expert.npz"
@@ -2338,8 +1982,8 @@ def distil(distiller, args, planning, header, out):
     student, config, replay = distiller.student, distiller.config, distiller.replay
     playing = dataclasses.replace(planning, samples=64, iterations=3, q_alone=config.q_alone)
     settings = {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
-                "distill": dataclasses.asdict(config),
-                "own_planner": dataclasses.asdict(playing) if config.own_episodes else None,
+                "distill": asdict(config),
+                "own_planner": asdict(playing) if config.own_episodes else None,
                 "data": [checksum(distiller.expert.params.values()),
                          checksum([replay.observation, replay.action, replay.ends]),
                          replay.header.get("task")]}
@@ -2351,8 +1995,7 @@ def distil(distiller, args, planning, header, out):
     rank, returns = rank_correlation(distiller, 256, args.seed, planning.discount)
     save_model(out / "student.npz", student, {"kind": "student", **settings,
                                               "training": header.get("training", {})})
-    with atomic_file(out / "config.json", "w") as file:
-        json.dump({**settings, "planner": dataclasses.asdict(planning)}, file, indent=1)
+    write_json(out / "config.json", {**settings, "planner": asdict(planning)})
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
             "steps": config.steps, "seconds": round(seconds, 1), "kl_reward": curve[-1][3],
             "kl_value": curve[-1][4], "rank_correlation": float(rank[0]),
@@ -2366,9 +2009,9 @@ def evaluate_both(expert, path, student, args, planning, q_alone):
     where = args.episodes, args.eval_seed, args.workers
     theirs = evaluate(student, args.task, dataclasses.replace(planning, q_alone=q_alone), *where,
                       "evaluating the student")["returns"]
-    returns = recorded_returns(path, expert, planning, episode_seeds(args.eval_seed,
-                                                                     args.episodes))
-    recorded = returns is not None and not args.evaluate_expert
+    returns = None if args.evaluate_expert else recorded_returns(path, expert, planning,
+                                                                 args.eval_seed, args.episodes)
+    recorded = returns is not None
     if not recorded:
         returns = evaluate(expert, args.task, planning, *where, "evaluating the expert")["returns"]
     return {"episodes": args.episodes, "expert_recorded": recorded,
@@ -2384,14 +2027,13 @@ def time_both(expert, student, planning, obs, beside, keep):
     """Milliseconds of a decision, both planning alike: result's part.
 
     Where `beside` workers cost more than they save, the student's are those of one process,
-    unless they are to `keep`.
-    """
+    unless they are to `keep`."""
     with contextlib.ExitStack() as stack:
         planners = [stack.enter_context(Planner(model, planning, workers=workers))
                     for model, workers in ((expert, 0), (student, 0), (student, beside))]
         seconds = interleaved_seconds([functools.partial(p.act, obs) for p in planners], 20,
                                       "timing")
-    central, alone, parallel = (float(ms) for ms in 1e3 * np.median(seconds, 0))
+    central, alone, parallel = (1e3 * np.median(seconds, 0)).tolist()
     if not beside or (not keep and parallel >= alone):
         beside, parallel = 0, alone
     return {"plan_ms_expert": central, "plan_ms_expert_own": central, "plan_ms_student": parallel,
@@ -2401,31 +2043,26 @@ def time_both(expert, student, planning, obs, beside, keep):
 
 def report(result, planning, eval_seed):
     """Print distill's table."""
-    def row(name, kind, ms):
-        returns = (f"{result[f'{kind}_return_mean']:.0f} ± {result[f'{kind}_return_std']:.0f}"
-                   if kind else "the same plans")
-        return name, returns, f"{ms:.1f}", f"{result['plan_ms_expert'] / ms:.1f}"
-
+    expert, student = (f"{result[f'{kind}_return_mean']:.0f} ± {result[f'{kind}_return_std']:.0f}"
+                       for kind in ("expert", "student"))
+    source = "recorded" if result["expert_recorded"] else "measured now"
+    rows = [(f"expert ({source}), one process", expert, result["plan_ms_expert"]),
+            (f"student, N = {result['num_agents']}, one process", student,
+             result["plan_ms_student_in_process"]),
+            (f"student, with {result['plan_workers']} beside", "the same plans",
+             result["plan_ms_student"])][:3 if result["plan_workers"] else 2]
     print(f"\n{result['task']}, {result['episodes']} episodes, evaluation seed {eval_seed}, MPPI "
           f"with {planning.samples} samples, {planning.iterations} iterations, horizon "
           f"{planning.horizon}\n")
-    measured = "recorded" if result["expert_recorded"] else "measured now"
-    rows = [("", "return", "ms a decision", "speed-up"),
-            row(f"expert ({measured}), one process", "expert", result["plan_ms_expert"]),
-            row(f"student, N = {result['num_agents']}, one process", "student",
-                result["plan_ms_student_in_process"])]
-    beside = result["plan_workers"]
-    if beside:
-        rows.append(row(f"student, {beside} worker{'s' * (beside != 1)} beside", None,
-                        result["plan_ms_student"]))
-    print_table(rows)
-    rank, returns = (result[f"rank_correlation_{what}"] for what in ("by_step", "returns"))
+    print_table([("", "return", "ms a decision", "speed-up")] + [
+        (name, returns, f"{ms:.1f}", f"{rows[0][2] / ms:.1f}") for name, returns, ms in rows])
+    q, g = result["rank_correlation_by_step"], result["rank_correlation_returns"]
     kept = "-" if result["kept"] is None else f"{result['kept']:.2f}"
-    print(f"\nreturn kept {kept}, rank correlation of Q {rank[0]:.3f} (h = 0) to {rank[-1]:.3f} "
-          f"(h = {len(rank) - 1}), of the return {returns[-1]:.3f}, distilled in "
-          f"{result['seconds']:.0f} s, {result['seconds_total']:.0f} s in all, {result['out']}/"
-          + ("" if result["picture"] else
-             "\n(no picture: pip install 'fac-tdmpc-ref[plots]' draws curve.png)"))
+    print(f"\nreturn kept {kept}, rank correlation of Q {q[0]:.3f} (h = 0) to {q[-1]:.3f} (h = "
+          f"{len(q) - 1}), of the return {g[-1]:.3f}, distilled in {result['seconds']:.0f} s, "
+          f"{result['seconds_total']:.0f} s in all, {result['out']}/")
+    if not result["picture"]:
+        print("(no picture: pip install 'fac-tdmpc-ref[plots]' draws curve.png)")
 
 
 def return_kept(student, expert):
@@ -2449,22 +2086,20 @@ def command_evaluate(args):
     if "distill" in header:
         config = from_dict(DistillConfig, header["distill"], args.model)
         made_for.update(horizon=config.horizon, q_alone=config.q_alone)
-    planning = from_args(PlannerConfig, args, **made_for)
-    task = args.task or header.get("task")
+    planning, task = from_args(PlannerConfig, args, **made_for), args.task or header.get("task")
     if args.record and task != header.get("task"):
         raise UserError(f"{args.model}: header: task: expected {task!r} to record its returns, "
                         f"found {header.get('task')!r}")
     found = evaluate(model, task, planning, args.episodes, args.seed, args.workers)
-    returns = found["returns"]
-    result = {"return_mean": float(np.mean(returns)), "return_std": float(np.std(returns)),
-              "returns": returns, "plan_ms_median": found["plan_ms_median"],
-              "episodes": args.episodes, "task": task, "seed": args.seed}
     if args.record:
         record_returns(args.model, model, found)
+    returns, ms = found["returns"], found["plan_ms_median"]
+    mean, std = float(np.mean(returns)), float(np.std(returns))
     print_table([("task", "episodes", "return", "min", "max", "ms a decision"),
-                 (task, str(args.episodes), f"{np.mean(returns):.0f} ± {np.std(returns):.0f}",
-                  f"{min(returns):.0f}", f"{max(returns):.0f}", f"{found['plan_ms_median']:.1f}")])
-    return result
+                 (task, str(args.episodes), f"{mean:.0f} ± {std:.0f}", f"{min(returns):.0f}",
+                  f"{max(returns):.0f}", f"{ms:.1f}")])
+    return {"return_mean": mean, "return_std": std, "returns": returns, "plan_ms_median": ms,
+            "episodes": args.episodes, "task": task, "seed": args.seed}
 
 
 def add_config(parser, config_class, title=None, prefix="", skip=(), **defaults):
@@ -2489,11 +2124,9 @@ def add_config(parser, config_class, title=None, prefix="", skip=(), **defaults)
 
 def from_args(config_class, args, **defaults):
     """The config that the flags of `add_config` give, on top of `defaults`."""
-    for f in dataclasses.fields(config_class):
-        value = getattr(args, f"{config_class.__name__}.{f.name}", None)
-        if value is not None:
-            defaults[f.name] = value
-    return config_class(**defaults)
+    given = {f.name: getattr(args, f"{config_class.__name__}.{f.name}", None)
+             for f in dataclasses.fields(config_class)}
+    return config_class(**{**defaults, **{k: v for k, v in given.items() if v is not None}})
 
 
 def paper_preset(config_class):
@@ -2533,40 +2166,42 @@ def make_parser():
     sub = add_command(commands, "distill", command_distill, "Distil a task's expert into a "
                       "factored student (Algorithm 1), then evaluate and time both with MPPI.",
                       epilog="A run that was cut off goes on when the same command is given again.")
-    sub.add_argument("--task", default="reacher-hard", help="one of: " + ", ".join(TASKS))
-    sub.add_argument("--seed", type=natural, default=0, help="of distillation [0]")
-    sub.add_argument("--num-agents", type=int, help="N, a divisor of dim(A) [dim(A)]")
-    sub.add_argument("--preset", choices=("default", "paper"), default="default",
-                     help="paper: the paper's value of every setting that names one below (days on "
-                     "a laptop)")
-    sub.add_argument("--expert", help="expert file, or a folder with expert.npz and replay.npz "
-                     "[data/TASK]")
-    sub.add_argument("--replay", help="replay file [data/TASK/replay.npz]")
-    sub.add_argument("--out", help="folder for the results [runs/TASK-SEED]")
-    sub.add_argument("--episodes", type=int, default=20, help="evaluation episodes [20]")
-    sub.add_argument("--eval-seed", type=natural, default=0, help="of the evaluation episodes [0]")
-    sub.add_argument("--workers", type=natural, help="processes that run episodes side by side; 0: "
-                     "the evaluation's in this one [cores]")
-    sub.add_argument("--plan-workers", type=natural, help="processes beside this one that plan for "
-                     "a part of the agents, where planning is timed [one for every further core "
-                     "if that is faster than none]")
-    sub.add_argument("--evaluate-expert", action="store_true",
-                     help="measure the expert's return anew instead of reading its record")
+    add = sub.add_argument
+    add("--task", default="reacher-hard", help="one of: " + ", ".join(TASKS))
+    add("--seed", type=natural, default=0, help="of distillation [0]")
+    add("--num-agents", type=int, help="N, a divisor of dim(A) [dim(A)]")
+    add("--preset", choices=("default", "paper"), default="default", help="paper: the paper's "
+        "value of every setting that names one below (days on a laptop)")
+    add("--expert", help="expert file, or a folder with expert.npz and replay.npz [data/TASK]")
+    add("--replay", help="replay file [data/TASK/replay.npz]")
+    add("--out", help="folder for the results [runs/TASK-SEED]")
+    add("--eval-seed", type=natural, default=0, help="of the evaluation episodes [0]")
+    add("--plan-workers", type=natural, help="processes beside this one that plan for a part of "
+        "the agents, where planning is timed [one for every further core if that is faster]")
+    add("--evaluate-expert", action="store_true",
+        help="measure the expert's return anew instead of reading its record")
+    add_playing(sub)
     add_config(sub, DistillConfig)
     add_config(sub, PlannerConfig, prefix="plan-", skip=("horizon", "q_alone"))
 
     sub = add_command(commands, "evaluate", command_evaluate, "Plan with a model (expert or "
                       "student) through whole episodes.")
-    sub.add_argument("--model", required=True, help="an expert.npz or student.npz")
-    sub.add_argument("--task", help="one of: " + ", ".join(TASKS) + " [the model's own]")
-    sub.add_argument("--episodes", type=int, default=20, help="[20]")
-    sub.add_argument("--seed", type=natural, default=0, help="of the episodes [0]")
-    sub.add_argument("--workers", type=natural, help="processes that run episodes side by side; 0: "
-                     "all in this one [cores]")
-    sub.add_argument("--record", action="store_true",
-                     help="keep the returns in a .json file beside the model's, for distill")
+    add = sub.add_argument
+    add("--model", required=True, help="an expert.npz or student.npz")
+    add("--task", help="one of: " + ", ".join(TASKS) + " [the model's own]")
+    add("--seed", type=natural, default=0, help="of the episodes [0]")
+    add("--record", action="store_true",
+        help="keep the returns in a .json file beside the model's, for distill")
+    add_playing(sub)
     add_config(sub, PlannerConfig)
     return parser
+
+
+def add_playing(parser):
+    """The flags of what is played."""
+    parser.add_argument("--episodes", type=int, default=20, help="evaluation episodes [20]")
+    parser.add_argument("--workers", type=natural, help="processes that play episodes side by "
+                        "side; 0: all in this one [cores]")
 
 
 def run_command(parser, argv=None):
@@ -2576,6 +2211,10 @@ def run_command(parser, argv=None):
         result = args.run(args)
     except (UserError, MemoryError) as error:
         print(f"{parser.prog}: error: {str(error) or 'not enough memory'}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"{parser.prog}: error: {error.filename}: can't be read or written: "
+              f"{error.strerror}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"{parser.prog}: interrupted; the same command goes on from its last checkpoint, "

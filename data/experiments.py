@@ -37,14 +37,14 @@ MODES = ("one-thread", "processes", "critical-path")
 
 
 class Predictor:
-    """f_T, f_R and f_Q alone, on fixed inputs in kept buffers: predictor("f_T").
+    """f_T, f_R and f_Q alone, on fixed inputs: predictor("f_T").
 
     workers: processes beside this one that share the agents; their inputs are there already.
     """
 
     def __init__(self, model, workers=0):
         mine, *theirs = fac.split_agents(model.config.num_agents, workers)
-        self.model, self._arena = model.agents(mine.start, mine.stop), fac.Arena()
+        self.model = model.agents(mine.start, mine.stop)
         sizes = self.model.config
         self._x = np.random.default_rng(0).standard_normal(
             (sizes.num_agents, sizes.latent_dim + sizes.agent_actions, TABLE3_BATCH), fac.F32)
@@ -54,10 +54,9 @@ class Predictor:
 
     def __call__(self, function):
         self._workers.send_all(function)
-        self._arena.rewind()
+        kinds = fac.QNET if function == "f_Q" else fac.MLP
         for name in FUNCTIONS[function]:
-            fac.forward(fac.QNET if function == "f_Q" else fac.MLP, self.model.params, name,
-                        self._x, empty=self._arena.empty)
+            fac.forward(kinds, self.model.params, name, self._x)
         self._workers.receive_all()
 
     def close(self):

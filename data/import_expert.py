@@ -32,6 +32,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import fac_tdmpc_ref as fac  # noqa: E402
+from train_expert import ReplayBuffer  # noqa: E402
 
 MAX_BYTES = 1 << 29  # of a file, unpacked; a checkpoint with Table 2's sizes has 13 MB
 MAX_RATIO = 50  # unpacked bytes for each packed one, beyond the first MAX_PIECE
@@ -395,7 +396,7 @@ def collect(model, environment, episodes, seed):
     """A buffer of episodes that the model plays, each with noise of another deviation."""
     planning = fac.PlannerConfig(samples=128, iterations=4)  # takes a fifth of the default's time
     decisions = episodes * fac.EPISODE_STEPS
-    buffer = fac.ReplayBuffer(environment.dim_obs, environment.dim_action, decisions)
+    buffer = ReplayBuffer(environment.dim_obs, environment.dim_action, decisions)
     with fac.Planner(model, planning) as planner, \
             fac.progress("collecting", decisions, "decision") as bar:
         for i in range(episodes):

@@ -25,6 +25,20 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import fac_tdmpc_ref as fac  # noqa: E402
 
+
+@dataclasses.dataclass(frozen=True)
+class TrainingConfig(fac.ExpertConfig):
+    """Training the expert (Equation 1)."""
+    updates_per_step: float = fac.field(1.0, "updates for each decision", least=0)
+    std_start: float = fac.field(0.5, "smallest sampling deviation at the start (TD-MPC)", least=0)
+    std_steps: int = fac.field(25_000, "decisions over which it falls to the planner's min_std",
+                               least=0)
+    seed_decisions: int = fac.field(4_000, "random decisions before the first update", least=0)
+    buffer_size: int = fac.field(1_000_000, "replay capacity, transitions (Table 2)", least=1)
+    buffer_dtype: str = fac.field("float32", "how the replay is kept in memory",
+                                  choices=("float32", "float16"))
+
+
 # for a few cores; hidden layers of 512, as in Table 2, make an update three times as dear
 TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
 FOLLOWING_DEFAULTS = {"noise_samples": 3}
@@ -51,7 +65,7 @@ class Episode:
     def play(self, planner, decisions):
         """Go on with a planner, whose actions get exploration noise, or with None: at random."""
         if planner and self._warm_start:
-            planner.warm_start = self._warm_start
+            planner.own.mean, planner.own.rngs, planner.own.t = self._warm_start
         elif planner:
             planner.reset(self.seed)
         for _ in range(decisions):
@@ -59,7 +73,8 @@ class Episode:
             obs, reward = self.environment.step(self.action[-1])
             self.observation.append(obs)
             self.reward.append(reward)
-        self._warm_start = planner and planner.warm_start
+        own = planner and planner.own
+        self._warm_start = own and (own.mean, own.rngs, own.t)
 
     def _explore(self, planner):
         if planner is None:
@@ -121,6 +136,66 @@ class Actors:
 
 # ------------------------------------------------------------------------------- learning
 
+class ReplayBuffer:
+    """Whole episodes in fixed memory, to learn from; the oldest go when it is full.
+
+    observation (E, T + 1, O), action (E, T, A), reward (E, T) with T = EPISODE_STEPS; capacity in
+    transitions; `count` episodes have been added so far.
+    """
+
+    def __init__(self, dim_obs, dim_action, capacity, dtype=np.float32):
+        episodes, self.count = max(1, capacity // fac.EPISODE_STEPS), 0
+        self.observation = np.zeros((episodes, fac.EPISODE_STEPS + 1, dim_obs), dtype)
+        self.action = np.zeros((episodes, fac.EPISODE_STEPS, dim_action), dtype)
+        self.reward = np.zeros((episodes, fac.EPISODE_STEPS), np.float32)
+
+    def __len__(self):
+        """Episodes held."""
+        return min(self.count, len(self.reward))
+
+    def add(self, observation, action, reward):
+        """Add an episode: (T + 1, O), (T, A), (T,)."""
+        i = self.count % len(self.reward)
+        self.observation[i], self.action[i], self.reward[i] = observation, action, reward
+        self.count += 1
+
+    def state(self):
+        """The episodes held, as arrays; `load` takes them back."""
+        n = len(self)
+        return {"observation": self.observation[:n], "action": self.action[:n],
+                "reward": self.reward[:n], "count": np.int64(self.count)}
+
+    def load(self, state):
+        """Hold what a `state` holds."""
+        n, self.count = len(state["reward"]), int(state["count"])
+        self.observation[:n], self.action[:n], self.reward[:n] = (
+            state[k] for k in ("observation", "action", "reward"))
+
+    def sample(self, rng, batch, steps):
+        """Segments drawn evenly, float32: observations (H + 1, O, B), actions (H, A, B), rewards
+        (H, B), and where they begin: episodes and steps, (B,) each."""
+        episode = rng.integers(len(self), size=batch)
+        start = rng.integers(fac.EPISODE_STEPS - steps + 1, size=batch)
+        rows = start + np.arange(steps + 1)[:, None]
+        obs = self.observation[episode, rows].astype(np.float32)
+        action = self.action[episode, rows[:-1]].astype(np.float32)
+        reward = self.reward[episode, rows[:-1]]
+        return obs.swapaxes(1, 2), action.swapaxes(1, 2), reward, (episode, start)
+
+    def write(self, path, header):
+        """A file for `Replay`: oldest episode first; an episode's last row has no action."""
+        order = np.arange(self.count - len(self), self.count) % len(self.reward)
+        action = np.zeros((len(order), fac.EPISODE_STEPS + 1, self.action.shape[2]), np.float16)
+        action[:, :-1] = self.action[order]
+        continues = np.ones(action.shape[:2], bool)
+        continues[:, -1] = False
+        fac.write_npz(path, {"kind": "replay", **header}, {
+            "observation": self.observation[order].reshape(-1, self.observation.shape[2])
+            .astype(np.float16),
+            "action": action.reshape(-1, action.shape[2]), "continues": continues.ravel()},
+            compress=True)
+
+
 class NumPyLearner(fac.Learner):
     """fac.Learner, with what the loop needs beside its `update`."""
     about = {"backend": "numpy"}
@@ -142,12 +217,12 @@ class NumPyLearner(fac.Learner):
 
 
 def named(name, optimizer):
-    """The state of a fac.Optimizer under its name."""
+    """The state of a fac.Adam under its name."""
     return {f"{name} {key}": value for key, value in optimizer.state().items()}
 
 
 def restore(name, optimizer, arrays):
-    """Give a fac.Optimizer the state that `named` has put into arrays."""
+    """Give a fac.Adam the state that `named` has put into arrays."""
     optimizer.load({key: arrays[f"{name} {key}"] for key in optimizer.state()})
 
 
@@ -177,19 +252,31 @@ class OnlineStudent:
     """Appendix C.1: Algorithm 1 on the batches, and with the expert, of a training that goes on."""
 
     def __init__(self, expert, num_agents, config, seed):
-        self.config, self.seed, self._arena = config, seed, fac.Arena()
+        self.config, self.seed = config, seed
         self.optimizer, self.model = fac.new_student(expert, num_agents, config, seed)
 
     def update(self, expert, obs, actions):
         """One step of Algorithm 1 on observations (O, B) and actions (H, A, B); its divergences."""
-        config, t = self.config, self.optimizer.adam.t
-        self._arena.rewind()
+        config, t = self.config, self.optimizer.t
         batch = fac.perturbed_batch(expert, self.model, obs, actions[:config.horizon + 1], config,
-                                    fac.stream(self.seed, "perturbations", t), self._arena.empty)
-        _, *divergences = fac.distill_loss(self.model, *batch, config, self.optimizer.grads,
-                                           self._arena.empty)
+                                    fac.stream(self.seed, "perturbations", t))
+        _, *divergences = fac.distill_loss(self.model, *batch, config, self.optimizer.grads)
         self.optimizer.step(fac.learning_rate(config, t), config.grad_clip)
         return divergences
+
+
+def move_target(obs, reward, back, chosen, task):
+    """Move the target of reacher segments back by `back` (B, 2) where chosen (B,), in place.
+
+    The observation is (3 joints, 2 finger-to-target, 3 velocities) and the dynamics don't know
+    the target, so this gives a true segment of an episode with another target; `back` = a later
+    step's finger-to-target puts it where the finger is then. obs (H+1, B, 8), reward (H, B): the
+    new one is that of the decision's end for all its repeated actions.
+    """
+    radius = fac.REACHER_TARGET[fac.lookup_task(task)[1]] + fac.FINGER_RADIUS
+    obs[:, chosen, 3:5] -= back[chosen]
+    distance = np.linalg.norm(obs[1:, chosen, 3:5], axis=-1)
+    reward[:, chosen] = fac.ACTION_REPEAT * (distance <= radius)
 
 
 def hindsight(task, buffer, where, obs, reward, rng):
@@ -205,7 +292,7 @@ def hindsight(task, buffer, where, obs, reward, rng):
     later = buffer.observation[episode, rng.integers(start + 1, fac.EPISODE_STEPS + 1), 3:5]
     moved, fresh = rng.random((2, len(start))) < [[3 / 4], [1 / 3]]
     back = np.where(fresh, obs[0, 3:5] - fac.draw_targets(obs[0], rng), later.T).T
-    fac.move_target(obs.swapaxes(1, 2), reward, back.astype(np.float32), moved, task)
+    move_target(obs.swapaxes(1, 2), reward, back.astype(np.float32), moved, task)
 
 
 class Training:
@@ -223,7 +310,7 @@ class Training:
             dim_obs, dim_action, 1, config.latent_dim, config.enc_dim, config.mlp_dim), config)
         self.student = distilling and OnlineStudent(self.learner.model, args.num_agents,
                                                     distilling, args.seed)
-        self.buffer = fac.ReplayBuffer(dim_obs, dim_action, config.buffer_size,
+        self.buffer = ReplayBuffer(dim_obs, dim_action, config.buffer_size,
                                        np.dtype(config.buffer_dtype))
         self.decisions, self.allowed, self.seconds, self.curve = 0, 0.0, 0.0, []
         self.settings = {key: getattr(args, key) for key in (
@@ -401,7 +488,7 @@ def lag(curve, fraction):
 
 def read_settings(args):
     """(training, planning, distillation or None) of a command line; UserError if they don't fit."""
-    config = fac.from_args(fac.ExpertConfig, args, **TRAINING_DEFAULTS)
+    config = fac.from_args(TrainingConfig, args, **TRAINING_DEFAULTS)
     planning = fac.from_args(fac.PlannerConfig, args, horizon=config.horizon,
                              discount=config.discount)
     distilling = fac.from_args(fac.DistillConfig, args, **FOLLOWING_DEFAULTS)
@@ -428,7 +515,8 @@ def read_settings(args):
 def train(args):
     """Train, or go on, until --steps or --minutes; returns the result."""
     config, planning, distilling = read_settings(args)
-    out = fac.output_folder(args.out or f"runs/train-{args.task}-{args.seed}")
+    out = Path(args.out or f"runs/train-{args.task}-{args.seed}")
+    out.mkdir(parents=True, exist_ok=True)
     training, checkpoint = Training(args, config, planning, distilling), out / "checkpoint.npz"
     if checkpoint.exists():
         training.load(checkpoint)
@@ -549,7 +637,7 @@ def make_parser():
         "on the way [4000]")
     add("--evaluate-episodes", type=natural, default=10, help="episodes in one [10]")
     add("--json", action="store_true", help="print one JSON object as the last line of stdout")
-    fac.add_config(parser, fac.ExpertConfig, **TRAINING_DEFAULTS)
+    fac.add_config(parser, TrainingConfig, **TRAINING_DEFAULTS)
     fac.add_config(parser, fac.PlannerConfig, "MPPI while training", "plan-",
                    skip=("discount", "q_alone"))
     fac.add_config(parser, fac.DistillConfig, "The student (Algorithm 1), on the expert's batches "

@@ -125,10 +125,11 @@ def test_a_share_of_the_states_is_the_students_own(replay):
             assert starts.max() < rows
     for quarters, expected in ((0, 0), (1, 2), (2, 4), (3, 6)):
         with fresh(replay, fac.dataclasses.replace(config, own_episodes=2)) as distiller:
-            distiller.optimizer.adam.t = quarters * 75
-            assert distiller.episodes_due == expected
-            distiller.add(*own_episodes(*range(expected)))
-            assert distiller.episodes_due == 0
+            distiller.optimizer.t = quarters * 75
+            asked = []
+            run = distiller.run(lambda n, asked=asked: asked.append(n) or own_episodes(*range(n)))
+            next(run), next(run)
+            assert asked == [expected] * bool(expected)
 
 
 def test_each_state_of_a_pool_is_learned_from_as_often_as_it_says(replay, monkeypatch):

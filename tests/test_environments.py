@@ -275,7 +275,7 @@ CHOSEN = np.array([True, False, True, True, False])
 
 def test_hindsight_moves_the_target_to_the_later_finger(segments):
     obs, reward, later = (a.copy() for a in segments)
-    fac.move_target(obs, reward, later[:, 3:5], CHOSEN, "reacher-hard")
+    train_expert.move_target(obs, reward, later[:, 3:5], CHOSEN, "reacher-hard")
     target = finger_position(obs[:, :, :3]) + obs[:, :, 3:5]    # (H + 1, B, 2), implied
     expected = np.broadcast_to(finger_position(later[:, :3]), target.shape)
     np.testing.assert_allclose(target[:, CHOSEN], expected[:, CHOSEN], atol=1e-6)
@@ -287,7 +287,7 @@ def test_hindsight_moves_the_target_to_the_later_finger(segments):
 def test_hindsight_changes_nothing_else(segments):
     obs, reward, later = (a.copy() for a in segments)
     reward[:] = 7  # no true reward: shows where it is written
-    fac.move_target(obs, reward, later[:, 3:5], CHOSEN, "reacher-hard")
+    train_expert.move_target(obs, reward, later[:, 3:5], CHOSEN, "reacher-hard")
     np.testing.assert_array_equal(obs[:, ~CHOSEN], segments[0][:, ~CHOSEN])
     np.testing.assert_array_equal(np.delete(obs, [3, 4], 2), np.delete(segments[0], [3, 4], 2))
     np.testing.assert_array_equal(later, segments[2])
@@ -303,14 +303,14 @@ def test_hindsight_rewards_are_those_of_the_new_distance(task, radius):
     obs[1, :, 3] += radius - 1e-4
     obs[2, :, 4] += radius + 1e-4
     reward = np.full((3, 3), 9.0)
-    fac.move_target(obs, reward, later[:, 3:5], np.array([True, True, False]), task)
+    train_expert.move_target(obs, reward, later[:, 3:5], np.array([True, True, False]), task)
     np.testing.assert_array_equal(reward, [[2, 2, 9], [0, 0, 9], [2, 2, 9]])
 
 
 def test_hindsight_agrees_with_an_environment_that_has_that_target(segments):
     """The dynamics don't know the target: playing on with it moved gives the same segment."""
     obs, reward, later = (a.copy() for a in segments)
-    fac.move_target(obs, reward, later[:, 3:5], np.ones(5, bool), "reacher-hard")
+    train_expert.move_target(obs, reward, later[:, 3:5], np.ones(5, bool), "reacher-hard")
     env = environment("reacher-hard")
     for b in range(5):
         env.reset(b)

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 import fac_tdmpc_ref as fac
-from test_golden import FORWARD, GRADIENT, NARROW, TASKS, assert_digest, narrow_expert, relative
+from test_golden import (FORWARD, GRADIENT, NARROW, TASKS, assert_digest, narrow_expert, present,
+                         relative)
 from test_layers import assert_close, numeric_gradient
 
 CONFIG = fac.ExpertConfig(latent_dim=3, enc_dim=5, mlp_dim=6, lam=0.7, batch_size=4,
@@ -80,7 +81,7 @@ def golden_case(source):
     else:
         header, g = fac.read_npz(fac.DATA / source / "golden.npz", ("golden",))
         models = [fac.load_model(fac.DATA / source / "expert.npz")[0]] * 2
-    return *models, g, fac.from_dict(fac.ExpertConfig, header["training"], source)
+    return *models, g, fac.ExpertConfig(**present(fac.ExpertConfig, header["training"]))
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -189,6 +190,6 @@ def test_an_update_s_targets_and_policy_see_that_noise(monkeypatch):
         rng = np.random.default_rng(5)
         learner = small_learner(rng, np.float32)
         found, _ = learner.update(*small_batch(rng, dtype=np.float32), rng)
-        terms.append((*found, learner.policy_optimizer.adam.m.sum()))
+        terms.append((*found, learner.policy_optimizer.m.sum()))
     assert terms[0] == terms[1] and terms[0][:2] == terms[2][:2]
     assert terms[0][2] != terms[2][2] and terms[0][3] != terms[2][3]

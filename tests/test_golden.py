@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import fac_tdmpc_ref as fac
+from export_golden import digest
 
 TASKS = sorted(p.parent.name for p in fac.DATA.glob("*/golden.npz"))
 FORWARD, GRADIENT, ADAM = 1e-5, 1e-4, 1e-5  # relative to the largest entry, or to the norm
@@ -26,7 +27,7 @@ def relative(found, expected):
 
 def assert_digest(array, expected, tolerance, size=None):
     """Norm, product with a fixed unit vector and 64 entries, all relative to the norm or `size`."""
-    error = np.abs(fac.digest(array) - expected).max() / (size or expected[0])
+    error = np.abs(digest(array) - expected).max() / (size or expected[0])
     assert error <= tolerance, error
 
 
@@ -99,19 +100,15 @@ def golden_student(header, g, expert, dtype):
 
 def ten_steps(student, batch, config, lr, losses, check_gradients=lambda grads: None):
     """Adam as Distiller runs it; returns the weights by name and whether every step clipped."""
-    vector, views = fac.flatten(student.params)
-    gradient, grads = fac.flatten({k: np.zeros_like(v) for k, v in views.items()})
-    student, clipped = fac.WorldModel(student.config, views), True
-    adam = fac.Adam(len(vector), vector.dtype)
+    adam = fac.Adam(student.params)
+    student, clipped = fac.WorldModel(student.config, adam.params), True
     for step, expected in enumerate(losses):
-        gradient[:] = 0
-        loss, _, _ = fac.distill_loss(student, *batch, config, grads)
+        loss, _, _ = fac.distill_loss(student, *batch, config, adam.grads)
         assert abs(loss / expected - 1) < ADAM
         if step == 0:
-            check_gradients(grads)
-        clipped &= fac.clip_norm(gradient, config.grad_clip) > config.grad_clip
-        adam.step(vector, gradient, lr)
-    return views, clipped
+            check_gradients(adam.grads)
+        clipped &= adam.step(lr, config.grad_clip) > config.grad_clip
+    return adam.params, clipped
 
 
 def test_kl_loss_and_gradients(golden):

@@ -366,7 +366,7 @@ def test_after_a_dead_worker_the_planner_says_so_again():
 def test_cores_are_those_this_process_may_use(monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 5, 7}, raising=False)
-    assert fac.cores() == fac.worker_count(None, 20) == 3 and fac.useful_workers(6) == 2
+    assert fac.cores() == 3 and fac.useful_workers(6) == 2
     monkeypatch.delattr(os, "sched_getaffinity")
     assert fac.cores() == 64
 

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ def episode(rng, value):
 @pytest.mark.parametrize("dtype", [np.float32, np.float16])
 def test_the_buffer_drops_the_oldest_and_writes_a_replay(tmp_path, dtype):
     rng = np.random.default_rng(0)
-    buffer = fac.ReplayBuffer(8, 3, 2 * fac.EPISODE_STEPS, dtype)
+    buffer = train_expert.ReplayBuffer(8, 3, 2 * fac.EPISODE_STEPS, dtype)
     for value in (1, 2, 3):
         buffer.add(*episode(rng, value))
     assert len(buffer) == 2
@@ -54,7 +55,7 @@ def test_the_buffer_drops_the_oldest_and_writes_a_replay(tmp_path, dtype):
 
 def test_segments_are_in_order_and_most_get_other_targets():
     rng = np.random.default_rng(1)
-    buffer = fac.ReplayBuffer(8, 3, fac.EPISODE_STEPS)
+    buffer = train_expert.ReplayBuffer(8, 3, fac.EPISODE_STEPS)
     walk = np.cumsum(rng.standard_normal((501, 8)) * 0.1 + 1, 0).astype(np.float32)
     buffer.add(walk, rng.uniform(-1, 1, (500, 3)), np.zeros(500))
     obs, _, reward, where = buffer.sample(rng, 400, 3)
@@ -95,7 +96,7 @@ def play(parts, seed=4, policy=True):
 def test_exploration_adds_noise_of_its_deviation(std):
     """Played twice with the same plans: what differs is the noise."""
     class Still:
-        warm_start = None
+        own = SimpleNamespace(mean=None, rngs=None, t=None)
 
         def reset(self, seed):
             pass
