@@ -64,6 +64,12 @@ class UserError(Exception):
     """Something the user can mend: printed as one line, exit status 2."""
 
 
+def need(condition, message):
+    """UserError with this message unless the condition holds."""
+    if not condition:
+        raise UserError(message)
+
+
 # ==== 1. Configuration ================================================================
 
 EPISODE_STEPS = 500  # T: decisions in an episode, 1000 control steps of dm_control
@@ -248,14 +254,11 @@ def divisors(n):
 def from_dict(config_class, values, where):
     """A config from a dict, e.g. a file's header; unknown keys and other types are refused."""
     known = {f.name: type(f.default) for f in dataclasses.fields(config_class)}
-    if not isinstance(values, dict):
-        raise UserError(f"{where}: expected settings, found {values!r}")
+    need(isinstance(values, dict), f"{where}: expected settings, found {values!r}")
     for key, value in values.items():
-        if key not in known:
-            raise UserError(f"{where}: unknown setting {key!r}; expected some of "
-                            f"{', '.join(known)}")
-        if type(value) is not known[key] and (known[key], type(value)) != (float, int):
-            raise UserError(f"{where}: {key}: expected {known[key].__name__}, found {value!r}")
+        need(key in known, f"{where}: unknown setting {key!r}; expected some of {', '.join(known)}")
+        need(type(value) is known[key] or (known[key], type(value)) == (float, int),
+             f"{where}: {key}: expected {known[key].__name__}, found {value!r}")
     try:
         return config_class(**values)
     except UserError as error:
@@ -828,10 +831,9 @@ class Distiller:
     def __init__(self, expert, replay, config, num_agents=None, seed=0):
         sizes = expert.config
         self.train_starts, self.held_out_starts = replay.starts(config.horizon + 1, config.held_out)
-        if (replay.dim_obs, replay.dim_action) != (sizes.dim_obs, sizes.dim_action):
-            raise UserError(f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, "
-                            f"{replay.dim_action}), the expert expects ({sizes.dim_obs}, "
-                            f"{sizes.dim_action}); pass the replay of the expert's task")
+        need((replay.dim_obs, replay.dim_action) == (sizes.dim_obs, sizes.dim_action),
+             f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, {replay.dim_action}), the "
+             f"expert expects ({sizes.dim_obs}, {sizes.dim_action}); pass its own task's replay")
         self.expert, self.config, self.seed = expert, config, seed
         self.replay, self.own_starts = copy.copy(replay), np.zeros(0, int)  # own episodes join it
         agents = sizes.dim_action if num_agents is None else num_agents
@@ -1015,9 +1017,8 @@ def mppi(returns, mean, config, rngs, proposals=None):
             actions = np.concatenate([actions, proposals], -1)
             G = np.concatenate([G, G_proposals], 1)
         G = np.where(np.isfinite(G), G, F32(-np.inf))  # these weigh nothing
-        if np.isneginf(G.max(1)).any():
-            raise UserError("planning: no action sequence has a finite return; the model's weights "
-                            "or the observation are far out of range")
+        need(np.isfinite(G.max(1)).all(), "planning: no action sequence has a finite return; the "
+             "model's weights or the observation are far out of range")
         best = np.argpartition(-G, config.num_elites - 1, axis=1)[:, :config.num_elites]
         elites = np.take_along_axis(actions, best[:, None, None], 3)
         G = np.take_along_axis(G, best, 1)
@@ -1107,11 +1108,9 @@ class Planner(contextlib.AbstractContextManager):
     def act(self, obs):
         """obs (O,), anything that converts to float32 -> action (A,) float32 in [-1, 1]."""
         obs = np.asarray(obs, F32)
-        if obs.shape != (self.model.config.dim_obs,):
-            raise UserError(f"observation: expected shape ({self.model.config.dim_obs},), "
-                            f"found {obs.shape}")
-        if not np.isfinite(obs).all():
-            raise UserError("observation: holds values that are not finite")
+        shape = (self.model.config.dim_obs,)
+        need(obs.shape == shape, f"observation: expected shape {shape}, found {obs.shape}")
+        need(np.isfinite(obs).all(), "observation: holds values that are not finite")
         with one_thread():
             z = self.model.encode(obs[:, None])
             for i, part in enumerate(self._parts[1:]):
@@ -1241,9 +1240,8 @@ class Returns:
 
 def split_agents(agents, workers):
     """Agents of this process and of each worker beside it, as slices; UserError for too many."""
-    if not 0 <= workers < agents:
-        raise UserError(f"{workers} workers are no use to {agents} agents, one of which is left "
-                        f"to this process; pass 0 to {agents - 1}")
+    need(0 <= workers < agents, f"{workers} workers are no use to {agents} agents, one of which is "
+         f"left to this process; pass 0 to {agents - 1}")
     cuts = np.linspace(0, agents, workers + 2).round().astype(int)
     return [slice(i, j) for i, j in zip(cuts, cuts[1:])]
 
@@ -1508,18 +1506,21 @@ FORMAT = "fac-tdmpc-ref 1"
 
 @contextlib.contextmanager
 def atomic_file(path, mode="wb", **options):
-    """A file that appears under its name, in a folder made for it, only when it is complete."""
+    """A file that appears under its name only when it is complete; UserError if it can't."""
     path, temporary = Path(path), None
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=path.name, suffix=".tmp", dir=path.parent)
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(prefix=path.name, suffix=".tmp", dir=path.parent)
         with os.fdopen(handle, mode, **options) as file:
             yield file
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
+    except OSError as error:
+        raise UserError(f"{path}: can't be written: {error.strerror or error}") from error
     finally:
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(temporary)
+        if temporary:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(temporary)
 
 
 def write_npz(path, header, arrays, compress=False):
@@ -1547,12 +1548,10 @@ def read_npz(path, kind):
         raise UserError(f"{path}: header: expected a JSON entry of this name, found none; "
                         f"files of this project are made by data/train_expert.py and distill"
                         ) from None
-    if header.get("format") != FORMAT:
-        raise UserError(f"{path}: header: format: expected {FORMAT!r}, found "
-                        f"{header.get('format')!r}; make the file anew with this version")
-    if header.get("kind") not in kind:
-        raise UserError(f"{path}: header: kind: expected {' or '.join(kind)}, found "
-                        f"{header.get('kind')!r}")
+    need(header.get("format") == FORMAT, f"{path}: header: format: expected {FORMAT!r}, found "
+         f"{header.get('format')!r}; make the file anew with this version")
+    need(header.get("kind") in kind, f"{path}: header: kind: expected {' or '.join(kind)}, found "
+         f"{header.get('kind')!r}")
     return header, arrays
 
 
@@ -1576,32 +1575,23 @@ def load_model(path):
             on_disk = expected if kind == "linear" and part == "weight" else expected[:2]
             on_disk = on_disk[1:] if expected[0] == 1 else on_disk
             value = arrays.pop(key, None)
-            if value is None:
-                raise UserError(f"{path}: {key}: missing; expected float32 {on_disk}")
-            if value.shape != on_disk or value.dtype != F32:
-                raise UserError(f"{path}: {key}: expected float32 {on_disk}, found {value.dtype} "
-                                f"{value.shape}; the header's sizes and the weights disagree")
-            check_values(value, path, key)
+            need(value is not None, f"{path}: {key}: missing; expected float32 {on_disk}")
+            need((value.shape, value.dtype) == (on_disk, F32),
+                 f"{path}: {key}: expected float32 {on_disk}, found {value.dtype} {value.shape}; "
+                 f"the header's sizes and the weights disagree")
+            need(np.isfinite(value).all(), f"{path}: {key}: holds values that are not finite")
             params[key] = np.ascontiguousarray(value.reshape(expected))
-    if arrays:
-        raise UserError(f"{path}: {next(iter(arrays))}: unknown entry; expected "
-                        f"TD-MPC's state-dict names only")
+    need(not arrays, f"{path}: {next(iter(arrays), None)}: unknown entry; expected TD-MPC's "
+         f"state-dict names only")
     return WorldModel(config, params), header
-
-
-def check_values(array, path, key):
-    """UserError if a file's array holds values that are not finite."""
-    if not np.isfinite(array).all():
-        raise UserError(f"{path}: {key}: holds values that are not finite")
 
 
 def trained_discount(header, where):
     """gamma of a model's Q, or of its expert's: what it plans with; 0.99 if its file is silent."""
     training = header.get("training") or {}
     found = training.get("discount", 0.99) if isinstance(training, dict) else training
-    if not isinstance(found, (int, float)) or not 0 <= found <= 1:
-        raise UserError(f"{where}: header: training: discount: expected a number between 0 and 1, "
-                        f"found {found!r}")
+    need(isinstance(found, (int, float)) and 0 <= found <= 1, f"{where}: header: training: "
+         f"discount: expected a number between 0 and 1, found {found!r}")
     return float(found)
 
 
@@ -1616,18 +1606,17 @@ class Replay:
         self.header, arrays = read_npz(path, ("replay",))
         for key, rank, dtype in (("observation", 2, np.float16), ("action", 2, np.float16),
                                  ("continues", 1, np.bool_)):
-            value = arrays.get(key)
-            if value is None or value.ndim != rank or value.dtype != dtype or \
-                    len(value) != len(arrays["observation"]):
-                found = "nothing" if value is None else f"{value.dtype} {value.shape}"
-                raise UserError(f"{path}: {key}: expected {dtype.__name__} of rank {rank} with a "
-                                f"row for each transition, found {found}")
-            check_values(value, path, key)
+            value = arrays.get(key, np.zeros(0, object))
+            need((value.ndim, value.dtype) == (rank, dtype)
+                 and len(value) == len(arrays["observation"]),
+                 f"{path}: {key}: expected {dtype.__name__} of rank {rank} with a row for each "
+                 f"transition, found {f'{value.dtype} {value.shape}' if value.size else 'nothing'}")
+            need(np.isfinite(value).all(), f"{path}: {key}: holds values that are not finite")
         self.observation, self.action = arrays["observation"], arrays["action"]
         self.ends = np.flatnonzero(~arrays["continues"])
         self.dim_obs, self.dim_action = self.observation.shape[1], self.action.shape[1]
-        if not len(self.ends) or self.ends[-1] != len(self.observation) - 1:
-            raise UserError(f"{path}: continues: expected False in the last row")
+        need(self.ends[-1:].tolist() == [len(self.observation) - 1],
+             f"{path}: continues: expected False in the last row")
 
     @property
     def transitions(self):
@@ -1647,9 +1636,9 @@ class Replay:
         training, held = [], []
         for i, (begin, end) in enumerate(zip(np.r_[0, self.ends + 1], self.ends)):
             (held if i % every == every - 1 else training).append(np.arange(begin, end - steps + 1))
-        if not held or not sum(map(len, training)) or not sum(map(len, held)):
-            raise UserError(f"{self.path}: {len(self.ends)} episodes are too few to hold out a "
-                            f"share of {held_out} and sample {steps} steps; collect more")
+        need(sum(map(len, training)) and sum(map(len, held)),
+             f"{self.path}: {len(self.ends)} episodes are too few to hold out a share of "
+             f"{held_out} and sample {steps} steps; collect more")
         return np.concatenate(training), np.concatenate(held)
 
     def sequences(self, starts, steps):
@@ -1710,26 +1699,27 @@ def play(model, task, config, seeds, workers=None, label="playing"):
 
     workers: processes that share the episodes [one for each core]; 0: all in this one. An episode
     depends on its seed alone, so that number changes nothing."""
-    workers = min(cores() if workers is None else workers, len(seeds))
-    parts = [seeds[w::workers or 1] for w in range(workers or 1)]
-    here, played = decisions(model, task, config, seeds), [[] for _ in parts]
-    with progress(label, len(seeds) * EPISODE_STEPS, "decision") as bar, \
+    E, T, sizes = len(seeds), EPISODE_STEPS, model.config
+    found = [np.zeros((E, T, *shape), F32) for shape in ((sizes.dim_obs,), (sizes.dim_action,))]
+    found += [np.zeros((E, T)) for _ in range(2)]
+    workers = min(cores() if workers is None else workers, E)
+    parts = [range(w, E, workers or 1) for w in range(workers or 1)]
+    here, done = decisions(model, task, config, seeds), [0] * len(parts)
+    with progress(label, E * T, "decision") as bar, \
             Workers(_playing_worker, workers, "evaluation worker") as pool:
         for w in range(workers):
-            pool.send(w, (model, task, config, parts[w]))
+            pool.send(w, (model, task, config, [seeds[i] for i in parts[w]]))
         while bar.n < bar.total:
-            for w, found in enumerate(played):
-                if len(found) < len(parts[w]) * EPISODE_STEPS:
-                    found += pool.receive(w) if workers else itertools.islice(here, 25)
-            bar.update(sum(map(len, played)) - bar.n)
-            mean = EPISODE_STEPS / bar.n * sum(reward for f in played for _, _, reward, _ in f)
-            bar.set_postfix_str(f"mean return so far about {mean:.0f}", False)
-    episodes = [None] * len(seeds)
-    for w, found in enumerate(played):
-        episodes[w::len(parts)] = [found[t:t + EPISODE_STEPS]
-                                   for t in range(0, len(found), EPISODE_STEPS)]
-    return tuple(np.array([list(column) for column in columns])
-                 for columns in zip(*(zip(*episode) for episode in episodes)))
+            for w, part in enumerate(parts):
+                if done[w] < len(part) * T:
+                    played = pool.receive(w) if workers else list(itertools.islice(here, 25))
+                    i, t = part[done[w] // T], done[w] % T
+                    for array, values in zip(found, zip(*played)):
+                        array[i, t:t + len(played)] = values
+                    done[w] += len(played)
+            bar.update(sum(done) - bar.n)
+            bar.set_postfix_str(f"mean return so far about {found[2].sum() * T / bar.n:.0f}", False)
+    return found
 
 
 def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="evaluating"):
@@ -1738,8 +1728,6 @@ def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="eval
     Gives {"returns", "seed", "planner" (its settings), "plan_ms_median" (of the episodes' mean
     decisions)}. Raises UserError if the model isn't for the task."""
     check_task(model.config, task)
-    if episodes < 1:
-        raise UserError(f"episodes must be at least 1, not {episodes}")
     _, _, rewards, seconds = play(model, task, config, episode_seeds(seed, episodes), workers,
                                   label)
     return {"returns": rewards.sum(1).tolist(), "seed": seed, "planner": asdict(config),
@@ -1749,9 +1737,9 @@ def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="eval
 def check_task(sizes, task):
     """UserError if a model of these sizes isn't for the task."""
     _, _, *dims = lookup_task(task)
-    if dims != [sizes.dim_obs, sizes.dim_action]:
-        raise UserError(f"the model has (dim O, dim A) = ({sizes.dim_obs}, {sizes.dim_action}), "
-                        f"{task} has ({dims[0]}, {dims[1]}); name the task it was made for")
+    need(dims == [sizes.dim_obs, sizes.dim_action],
+         f"the model has (dim O, dim A) = ({sizes.dim_obs}, {sizes.dim_action}), {task} has "
+         f"({dims[0]}, {dims[1]}); name the task it was made for")
 
 
 def progress(label, total, unit, initial=0):
@@ -1829,9 +1817,8 @@ def train_student(distiller, out, settings, playing, workers):
 def check_finite(values, update, lr):
     """UserError if learning diverged, before its weights are saved."""
     for name, value in values.items():
-        if not np.isfinite(value).all():
-            raise UserError(f"after update {update} the {name} no longer finite: learning "
-                            f"diverged; lower the learning rate ({lr})")
+        need(np.isfinite(value).all(), f"after update {update} the {name} no longer finite: "
+             f"learning diverged; lower the learning rate ({lr})")
 
 
 def same_settings(found, expected, where):
@@ -1840,10 +1827,10 @@ def same_settings(found, expected, where):
         values = found.get(key), expected.get(key)
         if all(isinstance(value, dict) for value in values):
             same_settings(*values, where)
-        elif values[0] != values[1]:
-            raise UserError(f"{where}: an unfinished run with other settings ({key}: expected "
-                            f"{values[1]}, found {values[0]}); finish it with its own, delete it, "
-                            f"or choose another --out")
+        else:
+            need(values[0] == values[1], f"{where}: an unfinished run with other settings ({key}: "
+                 f"expected {values[1]}, found {values[0]}); finish it with its own, delete it, or "
+                 f"choose another --out")
 
 
 def write_curve(path, columns, rows):
@@ -1969,9 +1956,8 @@ def load_data(args):
     path = args.expert or data_file(args.task, "expert.npz")
     expert, header = load_model(path)
     for key, expected in (("kind", "expert"), ("task", args.task)):
-        if header.get(key) != expected:
-            raise UserError(f"{path}: header: {key}: expected {expected!r}, found "
-                            f"{header.get(key)!r}")
+        need(header.get(key) == expected, f"{path}: header: {key}: expected {expected!r}, found "
+             f"{header.get(key)!r}")
     check_task(expert.config, args.task)
     Environment(args.task)  # what is missing is missed now, not after the last step
     return expert, header, Replay(args.replay or data_file(args.task, "replay.npz")), path
@@ -2087,9 +2073,8 @@ def command_evaluate(args):
         config = from_dict(DistillConfig, header["distill"], args.model)
         made_for.update(horizon=config.horizon, q_alone=config.q_alone)
     planning, task = from_args(PlannerConfig, args, **made_for), args.task or header.get("task")
-    if args.record and task != header.get("task"):
-        raise UserError(f"{args.model}: header: task: expected {task!r} to record its returns, "
-                        f"found {header.get('task')!r}")
+    need(task == header.get("task") or not args.record, f"{args.model}: header: task: expected "
+         f"{task!r} to record its returns, found {header.get('task')!r}")
     found = evaluate(model, task, planning, args.episodes, args.seed, args.workers)
     if args.record:
         record_returns(args.model, model, found)
@@ -2135,10 +2120,11 @@ def paper_preset(config_class):
             if "paper" in f.metadata}
 
 
-def natural(text):
-    """argparse type: a whole number, 0 or more."""
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"expected a whole number, 0 or more, found {text!r}")
+def natural(text, least=0):
+    """argparse type: a whole number, 0 (or `least`) or more."""
+    if not (text.isdecimal() and int(text) >= least):
+        raise argparse.ArgumentTypeError(f"expected a whole number, at least {least}, found "
+                                         f"{text!r}")
     return int(text)
 
 
@@ -2199,7 +2185,8 @@ def make_parser():
 
 def add_playing(parser):
     """The flags of what is played."""
-    parser.add_argument("--episodes", type=int, default=20, help="evaluation episodes [20]")
+    parser.add_argument("--episodes", type=functools.partial(natural, least=1), default=20,
+                        help="evaluation episodes [20]")
     parser.add_argument("--workers", type=natural, help="processes that play episodes side by "
                         "side; 0: all in this one [cores]")
 
@@ -2213,8 +2200,8 @@ def run_command(parser, argv=None):
         print(f"{parser.prog}: error: {str(error) or 'not enough memory'}", file=sys.stderr)
         return 2
     except OSError as error:
-        print(f"{parser.prog}: error: {error.filename}: can't be read or written: "
-              f"{error.strerror}", file=sys.stderr)
+        print(f"{parser.prog}: error: {error.filename}: can't be read or "
+              f"written: {error.strerror}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"{parser.prog}: interrupted; the same command goes on from its last checkpoint, "

@@ -32,6 +32,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import fac_tdmpc_ref as fac  # noqa: E402
+from fac_tdmpc_ref import need  # noqa: E402
 from train_expert import ReplayBuffer  # noqa: E402
 
 MAX_BYTES = 1 << 29  # of a file, unpacked; a checkpoint with Table 2's sizes has 13 MB
@@ -45,12 +46,6 @@ MAX_NOISE = 0.5  # largest deviation of the noise on collected actions
 LEAST_EPISODES = 20  # distill holds out one in 20
 RESAVE = "torch.load it with weights_only=True and torch.save its state dict alone"
 ELSEWHERE = "only TD-MPC's official state dicts, for state input, can be imported"
-
-
-def need(true, what):
-    """UserError if something isn't as it must be."""
-    if not true:
-        raise fac.UserError(what)
 
 
 def short(text):
