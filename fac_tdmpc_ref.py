@@ -35,7 +35,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import copy
 import csv
 import dataclasses
 import difflib
@@ -117,8 +116,8 @@ class ModelConfig(Settings):
     latent_dim: int = field(50, "m: latent features of an agent (Table 2)", least=1)
     enc_dim: int = field(256, "hidden width of the encoder (Table 2)", least=1)
     mlp_dim: int = field(512, "hidden width of an agent's other networks (Table 2)", least=1)
-    expert_latent_dim: int = field(0, "features of the expert's latent, where the trained encoder "
-                                   "reads that; 0: it reads the observation", least=0)
+    expert_latent_dim: int = field(0, "width of the expert's latent, if the encoder reads it, not "
+                                   "the observation", least=0)
     expert_enc_dim: int = field(256, "hidden width of the frozen expert encoder below it", least=1)
 
     def __post_init__(self):
@@ -138,25 +137,20 @@ class PlannerConfig(Settings):
     """MPPI. Raises UserError for values that can't plan."""
     samples: int = field(128, "S: action sequences drawn in an iteration [D10]", paper=512, least=1)
     iterations: int = field(4, "refinements of the proposal in a decision [D10]", paper=6, least=1)
-    elites: int = field(0, "sequences that refine the proposal; 0: samples / 8 (Table 2: 64)",
-                        least=0)
-    pi_trajs: int = field(24, "policy proposals, where the model has a policy (Table 2)", least=0)
-    horizon: int = field(3, "H of Equation 2: H rewards, then Q of action H + 1; 0: Q alone "
-                         "(Table 2)", least=0, most=EPISODE_STEPS - 1)
-    q_alone: int = field(0, "decisions of every 200, the first, that Q alone plans (H = 0) [D5]",
-                         least=0, most=200)
-    discount: float = field(0.99, "gamma, where the model's file names no other (Table 2)",
+    elites: int = field(0, "best ones, which refine it; 0: samples / 8 (Table 2: 64)", least=0)
+    pi_trajs: int = field(24, "policy proposals, where there is a policy (Table 2)", least=0)
+    horizon: int = field(3, "H of Equation 2 (Table 2)", least=0, most=EPISODE_STEPS - 1)
+    discount: float = field(0.99, "gamma, unless the model's file names its own (Table 2)",
                             least=0, most=1)
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)", above=0)
     max_std: float = field(2.0, "first and largest sampling deviation (Table 2)", above=0)
-    inverse_temperature: float = field(0.5, "an elite weighs exp(this * return); the `temperature` "
-                                       "of Table 2, which TD-MPC's code multiplies by", least=0)
-    momentum: float = field(0.1, "part of the old mean in the new one (TD-MPC's code)",
-                            least=0, most=1)
-    returns: str = field("fast", "the same return as it reads (plain: h_step_return), or fast",
+    inverse_temperature: float = field(0.5, "an elite weighs exp(this * G); the `temperature` of "
+                                       "Table 2, by which TD-MPC's code multiplies", least=0)
+    momentum: float = field(0.1, "part of the old mean in the new (TD-MPC's code)", least=0, most=1)
+    returns: str = field("fast", "Equation 2 as it reads (plain: h_step_return), or the same, fast",
                          choices=("fast", "plain"))
-    output: str = field("sampled", "the action: sampled from the elites by weight (TD-MPC's code) "
-                        "or the proposal's mean (the paper's text)", choices=("sampled", "mean"))
+    output: str = field("sampled", "the action: an elite drawn by score (TD-MPC's code) or the "
+                        "proposal's mean (the paper's text)", choices=("sampled", "mean"))
 
     def __post_init__(self):
         super().__post_init__()
@@ -178,17 +172,12 @@ class DistillConfig(Settings):
     batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=1)
     noise_samples: int = field(5, "K: perturbations of each action [D1]", paper=10, least=2)
     noise_std: float = field(2.0, "largest deviation of the perturbations [D8]", paper=0.5, above=0)
-    noise_std_min: float = field(0.2, "smallest; each state's is drawn between, evenly in the "
-                                 "logarithm [D8]", paper=0.5, above=0)
-    clip_actions: bool = field(True, "clip perturbed actions to [-1, 1], where planning looks [D8]",
-                               paper=False)
-    reuse: int = field(4, "steps that learn from a state's perturbations, whose expert's "
-                       "predictions are computed once [D1]", paper=1, least=1)
-    horizon: int = field(3, "H: the loss sums over h = 0..H, planning looks as far (Table 2)",
-                         least=0, most=EPISODE_STEPS - 1)
-    q_alone: int = field(50, "decisions of every 200, the first, that the student's Q alone plans "
-                         "(H = 0) [D5]", paper=0, least=0, most=200)
-    lam: float = field(1.0, "lambda: step h weighs lambda^h (rho in Table 2) [D5]", paper=0.5,
+    noise_std_min: float = field(0.2, "smallest; each state has its own between, log-uniform [D8]",
+                                 paper=0.5, above=0)
+    clip_actions: bool = field(True, "clip perturbed actions to [-1, 1] [D8]", paper=False)
+    reuse: int = field(4, "steps that learn from a state's perturbations [D1]", paper=1, least=1)
+    horizon: int = field(3, "H of loss and planning (Table 2)", least=0, most=EPISODE_STEPS - 1)
+    lam: float = field(1.0, "lambda (rho in Table 2): step h weighs lambda^h [D5]", paper=0.5,
                        least=0)
     reward_coef: float = field(0.5, "weight of the rewards' divergence (Table 2)", least=0)
     value_coef: float = field(0.1, "weight of each Q's divergence (Table 2)", least=0)
@@ -196,8 +185,8 @@ class DistillConfig(Settings):
     temperature_expert: float = field(0.5, "T_e (authors' code)", above=0)
     kl: str = field("forward", "forward: D(expert || student); reverse: D(student || expert), "
                     "Algorithm 1's order [D2]", paper="reverse", choices=("forward", "reverse"))
-    encoder_input: str = field("latent", "the student's encoder reads the observation, or the "
-                               "expert's latent [D3]", paper="observation",
+    encoder_input: str = field("latent", "the student's encoder reads the expert's latent or the "
+                               "observation [D3]", paper="observation",
                                choices=("latent", "observation"))
     lr: float = field(1e-3, "Adam's learning rate [D1]", paper=1e-4, above=0)
     lr_schedule: str = field("cosine", "cosine (to zero) or constant [D1]", paper="constant",
@@ -206,13 +195,12 @@ class DistillConfig(Settings):
     grad_clip: float = field(10.0, "largest gradient norm (Table 2)", above=0)
     sizes: str = field("table2", "agent sizes: table2 (m = 50) or section51 (m = 512 // N)",
                        choices=("table2", "section51"))
-    new_targets: float = field(0.5, "reacher only: states whose target is drawn anew [D7]",
+    new_targets: float = field(0.5, "reacher only: share of states with a new target [D7]",
                                paper=0.0, least=0, most=1)
     own_episodes: int = field(16, "episodes that the student plays after each of the first three "
-                              "quarters of the steps, to learn from [D9]", paper=0, least=0)
-    own_share: float = field(0.25, "share of states from the student's own episodes [D9]",
-                             paper=0.0, least=0, most=1)
-    held_out: float = field(0.05, "share of episodes held out for the rank correlation",
+                              "quarters, to learn from [D9]", paper=0, least=0)
+    own_share: float = field(0.25, "share of states from these [D9]", paper=0.0, least=0, most=1)
+    held_out: float = field(0.05, "share of episodes held out, for rank correlations",
                             above=0, most=0.5)
 
     def __post_init__(self):
@@ -282,6 +270,7 @@ def student_config(expert, num_agents, sizes, encoder_input):
 ENCODER = ("linear", "elu", "linear")
 MLP = ("linear", "elu", "linear", "elu", "linear")
 QNET = ("linear", "norm", "tanh", "linear", "elu", "linear")
+HEADS = (("_reward", MLP), ("_Q1", QNET), ("_Q2", QNET))
 NORM_EPS = 1e-5  # PyTorch's LayerNorm
 
 
@@ -355,10 +344,8 @@ def forward(kinds, params, name, x, tape=None):
         if kind in ("linear", "norm"):
             layer = linear if kind == "linear" else norm
             x = layer(x, params[f"{name}.{i}.weight"], params[f"{name}.{i}.bias"])
-        elif kind == "elu":
-            x = elu(x)
         else:
-            x = np.tanh(x)
+            x = elu(x) if kind == "elu" else np.tanh(x)
         if tape is not None:
             tape.append(x)
     return x
@@ -493,8 +480,7 @@ class WorldModel:
     def q(self, z, a):
         """Both values q^i = f_Q^i(s^i, a^i) -> two (N, B); the global ones are the sums."""
         x = np.concatenate([z, a], 1)
-        return tuple(forward(QNET, self.params, name, x)[:, 0]
-                     for name in ("_Q1", "_Q2"))
+        return tuple(forward(QNET, self.params, name, x)[:, 0] for name in ("_Q1", "_Q2"))
 
     def policy(self, z):
         """The expert's policy mean, z (1, m, B) -> (1, A, B) in (-1, 1)."""
@@ -514,17 +500,25 @@ class WorldModel:
                                    if k.startswith(("_dynamics", "_reward", "_Q"))})
 
 
+def policy_rollout(model, z, noise):
+    """Actions (L, N, d, B) of a model's policy, each with its noise (L of them), from latents z
+    (N, m, B) on, which its own dynamics roll out."""
+    actions = []
+    for eps in noise:
+        actions.append(np.clip(model.policy(z) + eps, -1, 1))
+        z = model.next(z, actions[-1])
+    return np.stack(actions)
+
+
 def networks(config, policy=False):
     """(name, layer kinds, agents, widths) of every network of a model."""
-    n, m, hidden = config.num_agents, config.latent_dim, config.mlp_dim
-    joint, latent = m + config.agent_actions, config.expert_latent_dim
+    n, m, hidden = config.num_agents, config.latent_dim, (config.mlp_dim, config.mlp_dim)
+    d, latent = config.agent_actions, config.expert_latent_dim
     found = [("_encoder", ENCODER, 1, (latent or config.dim_obs, config.enc_dim, n * m)),
-             ("_dynamics", MLP, n, (joint, hidden, hidden, m)),
-             ("_reward", MLP, n, (joint, hidden, hidden, 1)),
-             ("_Q1", QNET, n, (joint, hidden, hidden, 1)),
-             ("_Q2", QNET, n, (joint, hidden, hidden, 1))]
+             ("_dynamics", MLP, n, (m + d, *hidden, m)),
+             *((name, kinds, n, (m + d, *hidden, 1)) for name, kinds in HEADS)]
     if policy:
-        found.append(("_pi", MLP, n, (m, hidden, hidden, config.agent_actions)))
+        found.append(("_pi", MLP, n, (m, *hidden, d)))
     if latent:
         found.append(("_expert_encoder", ENCODER, 1,
                       (config.dim_obs, config.expert_enc_dim, latent)))
@@ -541,9 +535,6 @@ def layers(config, policy=False):
                 before, *after = after
             elif kind == "norm":
                 yield name, i, kind, (agents, before, 1), False
-
-
-HEADS = (("_reward", MLP), ("_Q1", QNET), ("_Q2", QNET))
 
 
 def unroll(model, z, actions, transitions, tapes=None):
@@ -591,9 +582,8 @@ def predict_backward(model, tapes, d_outputs, grads, d_latents=None):
     d_outputs: gradients of the three outputs; d_latents (L, N, m, B * K): of s_1, ..., s_L, where
     there were L transitions."""
     n, m = model.config.num_agents, model.config.latent_dim
-    steps, batch, noise = d_outputs[0].shape
+    (steps, batch, noise), dx = d_outputs[0].shape, 0
     columns = batch * noise
-    dx = 0
     for (name, kinds), d_out in zip(HEADS, d_outputs):
         # the global output is the sum over agents: each share has the same gradient
         d_share = np.repeat(d_out.reshape(1, 1, -1), n, 0)
@@ -649,8 +639,7 @@ def equation_1(model, obs, actions, reward, latents, td, config, grads=None):
     weights = (config.lam ** np.arange(steps) / batch).astype(z.dtype)[:, None]
     terms, d_outputs = [], []
     coefs = (config.reward_coef, config.value_coef, config.value_coef)
-    for coef, output, goal in zip(coefs, run_heads(model, x, actions, tapes),
-                                  (reward, td, td)):
+    for coef, output, goal in zip(coefs, run_heads(model, x, actions, tapes), (reward, td, td)):
         error = output[..., 0] - goal
         terms.append(float((weights * error ** 2).sum()))
         d_outputs.append((2 * coef / steps * weights * error)[..., None])
@@ -726,11 +715,6 @@ class Learner:
 
 # ==== 5. Model distillation (section 4.4, Algorithm 1, Equation 4) ====================
 
-# A softmax doesn't see a constant, so these have no gradient but rounding errors, and Adam lets
-# them wander. Planning doesn't see a constant either.
-UNSEEN = ("_reward.4.bias", "_Q1.5.bias", "_Q2.5.bias")
-
-
 def log_softmax(x):
     """log of exp(x) / sum exp(x) over the last axis."""
     x = x - x.max(-1, keepdims=True)
@@ -776,8 +760,7 @@ def distill_loss(student, features, actions, targets, config, grads=None):
         d_outputs.append(coef * weights[..., None] * d_output)
     if grads is not None:
         dz = predict_backward(student, tapes, d_outputs, grads)
-        backward(ENCODER, student.params, "_encoder", encoder_tape,
-                 dz.reshape(1, -1, batch), grads)
+        backward(ENCODER, student.params, "_encoder", encoder_tape, dz.reshape(1, -1, batch), grads)
     return loss, means[0], (means[1] + means[2]) / 2
 
 
@@ -789,8 +772,7 @@ def new_student(expert, num_agents, config, seed):
     student = WorldModel.create(sizes, stream(seed, "student"))
     frozen = {"_expert" + k: v for k, v in expert.params.items()
               if k.startswith("_encoder.") and config.encoder_input == "latent"}
-    optimizer = Adam({k: v for k, v in student.params.items()
-                           if not k.startswith("_expert")})
+    optimizer = Adam({k: v for k, v in student.params.items() if not k.startswith("_expert")})
     return optimizer, WorldModel(sizes, {**optimizer.params, **frozen})
 
 
@@ -835,7 +817,9 @@ class Distiller:
              f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, {replay.dim_action}), the "
              f"expert expects ({sizes.dim_obs}, {sizes.dim_action}); pass its own task's replay")
         self.expert, self.config, self.seed = expert, config, seed
-        self.replay, self.own_starts = copy.copy(replay), np.zeros(0, int)  # own episodes join it
+        need(expert.has_policy or not config.own_episodes, "the expert has no policy, which says "
+             "what to do in the student's own states; pass --own-episodes 0")
+        self.replay, self.own = replay, np.zeros((0, replay.dim_obs), np.float16)  # states [D9]
         agents = sizes.dim_action if num_agents is None else num_agents
         with one_thread():
             self.optimizer, self.student = new_student(expert, agents, config, seed)
@@ -850,11 +834,13 @@ class Distiller:
     def draw(self, number, part, size):
         """Line 4 and the expert's part of line 5 for a part of a pool, as `perturbed_batch`."""
         rng = stream(self.seed, f"pool {number}", part)
-        starts = rng.choice(self.train_starts, size)
-        if len(self.own_starts):  # [D9]
-            own = rng.random(size) < self.config.own_share
-            starts[own] = rng.choice(self.own_starts, own.sum())
-        obs, actions = self.replay.sequences(starts, self.config.horizon + 1)
+        obs, actions = self.replay.sequences(rng.choice(self.train_starts, size),
+                                             self.config.horizon + 1)
+        if len(self.own):  # [D9]
+            chosen = rng.random(size) < self.config.own_share
+            obs[:, chosen] = self.own[rng.integers(len(self.own), size=chosen.sum())].T
+            actions[..., chosen] = policy_rollout(
+                self.expert, self.expert.encode(obs[:, chosen]), [F32(0)] * len(actions))[:, 0]
         renew_targets(self.replay.header.get("task"), obs, self.config.new_targets, rng)
         return perturbed_batch(self.expert, self.student, obs, actions, self.config, rng)
 
@@ -897,13 +883,12 @@ class Distiller:
     def run(self, play=None):
         """Algorithm 1 from here to its end; yields the losses of each step.
 
-        play: takes the number of episodes that the student is to play, and returns them as `add`
-        takes them; not needed without own episodes [D9]."""
+        play: takes the number of episodes that the student is to play, and returns their states
+        as `add` takes them; not needed without own episodes [D9]."""
         while self.t < self.config.steps:
-            quarter = 4 * self.t // self.config.steps
-            due = quarter * self.config.own_episodes - self.episodes_played
-            if due:
-                self.add(*play(due))
+            quarter, played = 4 * self.t // self.config.steps, len(self.own) // EPISODE_STEPS
+            if quarter * self.config.own_episodes > played:
+                self.add(play(quarter * self.config.own_episodes - played))
             yield self.step()
 
     @property
@@ -911,31 +896,20 @@ class Distiller:
         """Steps made so far."""
         return self.optimizer.t
 
-    @property
-    def episodes_played(self):
-        """Episodes of the student's own in the data: each has as many starts as H leaves it."""
-        return len(self.own_starts) // (EPISODE_STEPS - self.config.horizon)
-
-    def add(self, observation, action):
-        """Let episodes (E, T, O), (E, T, A) that the student played join the data [D9]."""
-        begins = len(self.replay.observation) + EPISODE_STEPS * np.arange(len(action))[:, None]
-        self.replay.extend(observation, action)
-        starts = begins + np.arange(EPISODE_STEPS - self.config.horizon)
-        self.own_starts = np.r_[self.own_starts, starts.ravel()]
+    def add(self, observation):
+        """Let the states (E, T, O) of episodes that the student played join the data [D9]."""
+        self.own = np.concatenate([self.own, observation.reshape(-1, self.own.shape[1])
+                                   .astype(np.float16)])
         self._number = None  # its pool is drawn again, with them
 
     def state(self):
         """Everything that a resumed run needs."""
-        count = self.episodes_played
-        observation, action = (x[len(x) - count * EPISODE_STEPS:].reshape(
-            count, EPISODE_STEPS, x.shape[1]) for x in (self.replay.observation,
-                                                        self.replay.action))
-        return {**self.optimizer.state(), "own_observation": observation, "own_action": action}
+        return {**self.optimizer.state(), "own": self.own}
 
     def load(self, state):
-        """Go on from a `state`, before any step."""
+        """Go on from a `state`."""
         self.optimizer.load(state)
-        self.add(state["own_observation"], state["own_action"])
+        self.own, self._number = state["own"], None
 
     def close(self):
         """Stop the threads and give BLAS its own back."""
@@ -1037,45 +1011,36 @@ class AgentPlanner:
 
     def __init__(self, model, config):
         self.model, self.config = model, config
-        self.alone = dataclasses.replace(config, horizon=0)
         self.returns = Returns(model) if config.returns == "fast" else None
         self.reset([])
 
     def reset(self, seeds):
         """Forget the warm start; seeds: one SeedSequence for each agent, [] to keep streams."""
         sizes = self.model.config
-        self.t, self.mean = 0, np.zeros((sizes.num_agents, self.config.horizon + 1,
-                                         sizes.agent_actions), F32)
+        self.mean = np.zeros((sizes.num_agents, self.config.horizon + 1, sizes.agent_actions), F32)
         if len(seeds):
             self.rngs = [np.random.Generator(np.random.SFC64(s)) for s in seeds]
 
     def plan(self, z):
         """z (N, m, 1) -> the agents' first actions (N, d); keeps the warm start."""
-        config = self.alone if self.t % 200 < self.config.q_alone else self.config  # [D5]
-        self.t += 1
+        config = self.config
         returns = (self.returns.start(z, config) if self.returns else
                    functools.partial(h_step_return, self.model, z, config=config))
-        start = np.ascontiguousarray(self.mean[:, :config.horizon + 1])
-        mean, elites, scores = mppi(returns, start, config, self.rngs, self._proposals(z, config))
-        self.mean[:] = 0
-        self.mean[:, :config.horizon] = mean[:, 1:]
+        mean, elites, scores = mppi(returns, self.mean, config, self.rngs, self._proposals(z))
+        self.mean = np.concatenate([mean[:, 1:], np.zeros_like(mean[:, :1])], 1)
         if config.output == "mean":
             return mean[:, 0]
         pick = [min(np.searchsorted(np.cumsum(p), rng.random(), "right"), len(p) - 1)
                 for p, rng in zip(scores, self.rngs)]
         return np.stack([e[0, :, i] for e, i in zip(elites, pick)])
 
-    def _proposals(self, z, config):
+    def _proposals(self, z):
         """Noisy policy rollouts (1, L, A, P), where there is a policy (TD-MPC's code)."""
-        if not (self.model.has_policy and config.pi_trajs):
+        P, L = self.config.pi_trajs, self.config.horizon + 1
+        if not (self.model.has_policy and P):
             return None
-        z, actions = np.repeat(z, config.pi_trajs, 2), []
-        for h in range(config.horizon + 1):
-            mu = self.model.policy(z)
-            actions.append(np.clip(mu + policy_noise(mu.shape, self.rngs[0]), -1, 1))
-            if h < config.horizon:
-                z = self.model.next(z, actions[-1])
-        return np.stack(actions, 1)
+        noise = policy_noise((L, 1, self.model.config.dim_action, P), self.rngs[0])
+        return policy_rollout(self.model, np.repeat(z, P, 2), noise).swapaxes(0, 1)
 
 
 class Planner(contextlib.AbstractContextManager):
@@ -1274,20 +1239,19 @@ class WorkerError(UserError):
 
 
 class Workers(contextlib.AbstractContextManager):
-    """`count` processes that each run target(connection, *shared).
+    """`count` processes that each run target(connection).
 
     Spawned, since fork is unsafe once BLAS has threads; with one BLAS thread each; deaf to
-    Ctrl-C, which ends the parent, whose closed pipes end them. Anything large is sent through
+    Ctrl-C, which ends the parent, whose closed pipes end them. What they work on is sent through
     the connection: a process that dies at its start would block a parent that passes it."""
 
-    def __init__(self, target, count, name="worker", shared=()):
+    def __init__(self, target, count, name="worker"):
         context, self._name, self._members = multiprocessing.get_context("spawn"), name, []
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which a child inherits
         try:
             for _ in range(count):
                 here, there = context.Pipe()
-                process = context.Process(target=_run_worker, args=(target, there, *shared),
-                                          daemon=True)
+                process = context.Process(target=_run_worker, args=(target, there), daemon=True)
                 process.start()
                 there.close()
                 self._members.append((process, here))
@@ -1340,12 +1304,12 @@ class Workers(contextlib.AbstractContextManager):
         self.close()
 
 
-def _run_worker(target, connection, *arguments):
+def _run_worker(target, connection):
     # the mask alone is not enough: multiprocessing's resource tracker unblocks SIGINT as it starts
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with one_thread():
-            target(connection, *arguments)
+            target(connection)
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the parent is gone or has closed the pipe
     except UserError as error:
@@ -1390,16 +1354,15 @@ REACHER_XML = f"""
     </default>
   </default>
   <worldbody>
-    <light pos="0 0 1"/>
-    <camera name="fixed" pos="0 0 0.75"/>
+    <light pos="0 0 1"/> <camera name="fixed" pos="0 0 0.75"/>
     <geom name="ground" type="plane" size="0.3 0.3 10" rgba="0.2 0.3 0.4 1"/>
     <geom name="target" type="sphere" pos="0 0 0.01" size="0.05" rgba="0.8 0.2 0.2 1"/>
     <body name="arm0" pos="0 0 0.01">
       <joint name="joint0"/> <geom name="arm0" class="link"/>
       <body name="arm1" pos="{REACHER_LINK} 0 0">
-        <joint name="joint1" limited="true" range="-80 80"/> <geom name="arm1" class="link"/>
+        <joint name="joint1" range="-80 80"/> <geom name="arm1" class="link"/>
         <body name="hand" pos="{REACHER_LINK} 0 0">
-          <joint name="joint2" limited="true" range="-80 80"/>
+          <joint name="joint2" range="-80 80"/>
           <geom name="hand" class="link" fromto="0 0 0 0.1 0 0"/>
           <body name="finger" pos="{REACHER_LINK} 0 0">
             <geom name="finger" type="sphere" size="{FINGER_RADIUS}" rgba="0.9 0.6 0.2 1"/>
@@ -1409,9 +1372,7 @@ REACHER_XML = f"""
     </body>
   </worldbody>
   <actuator>
-    <motor name="joint0" joint="joint0"/>
-    <motor name="joint1" joint="joint1"/>
-    <motor name="joint2" joint="joint2"/>
+    <motor joint="joint0"/> <motor joint="joint1"/> <motor joint="joint2"/>
   </actuator>
 </mujoco>
 """
@@ -1622,12 +1583,6 @@ class Replay:
     def transitions(self):
         return len(self.observation) - len(self.ends)
 
-    def extend(self, observation, action):
-        """Add rows of whole episodes: (E, T, O), (E, T, A); `starts` doesn't know them."""
-        self.observation, self.action = (
-            np.concatenate([old, new.reshape(-1, old.shape[1]).astype(np.float16)])
-            for old, new in ((self.observation, observation), (self.action, action)))
-
     def starts(self, steps, held_out):
         """Rows from which `steps` actions stay in their episode: (training, held-out) rows.
 
@@ -1725,12 +1680,12 @@ def play(model, task, config, seeds, workers=None, label="playing"):
 def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="evaluating"):
     """Returns of `episodes` episodes, played side by side in `workers` processes (see `play`).
 
-    Gives {"returns", "seed", "planner" (its settings), "plan_ms_median" (of the episodes' mean
-    decisions)}. Raises UserError if the model isn't for the task."""
+    Gives {"returns", "plan_ms_median" (of the episodes' mean decisions)}. Raises UserError if the
+    model isn't for the task."""
     check_task(model.config, task)
-    _, _, rewards, seconds = play(model, task, config, episode_seeds(seed, episodes), workers,
-                                  label)
-    return {"returns": rewards.sum(1).tolist(), "seed": seed, "planner": asdict(config),
+    seeds = episode_seeds(seed, episodes)
+    _, _, rewards, seconds = play(model, task, config, seeds, workers, label)
+    return {"returns": rewards.sum(1).tolist(),
             "plan_ms_median": 1e3 * float(np.median(seconds.mean(1)))}
 
 
@@ -1771,15 +1726,15 @@ CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correla
 
 
 def train_student(distiller, out, settings, playing, workers):
-    """Algorithm 1 to its end, with a learning curve and checkpoints in `out`.
+    """Algorithm 1 to its end, with a learning curve and checkpoints in the folder `out`.
 
     A run that was cut off goes on from its checkpoint and ends as if it had not been. Returns
-    (curve rows, seconds). playing, workers: the planner and the processes of the student's own
-    episodes [D9]."""
+    (curve rows, seconds). playing, workers: how the student plays its own episodes [D9]."""
     def play_own(count):
-        seeds = training_seeds(distiller.seed, "own episode", distiller.episodes_played, count)
+        played = len(distiller.own) // EPISODE_STEPS
+        seeds = training_seeds(distiller.seed, "own episode", played, count)
         return play(distiller.student, settings["task"], playing, seeds, workers,
-                    "the student plays")[:2]
+                    "the student plays")[0]
 
     checkpoint, config, curve, before = out / "checkpoint.npz", distiller.config, [], 0.0
     if checkpoint.exists():
@@ -1797,15 +1752,14 @@ def train_student(distiller, out, settings, playing, workers):
             if distiller.t % every and distiller.t < config.steps:
                 continue
             means, losses = np.mean(losses, 0).tolist(), []
-            rank, returns = rank_correlation(distiller, 64, distiller.seed)
+            q, g = (x.tolist() for x in rank_correlation(distiller, 64, distiller.seed))
             check_finite({"weights are": distiller.optimizer.vector,
-                          "student's predictions are": rank}, distiller.t, config.lr)
+                          "student's predictions are": q}, distiller.t, config.lr)
             seconds = before + time.time() - began
             curve.append([distiller.t, round(seconds, 2), *means,
-                          learning_rate(config, distiller.t - 1), float(rank[0]), float(rank[-1]),
-                          float(returns[-1])])
+                          learning_rate(config, distiller.t - 1), q[0], q[-1], g[-1]])
             bar.set_postfix_str("loss {:.4f} KL reward {:.4f} value {:.4f} rank {:.3f}".format(
-                *means, returns[-1]), False)
+                *means, g[-1]), False)
             write_curve(out / "curve.csv", CURVE, curve)
             if time.time() - saved > 30 or distiller.t == config.steps:
                 write_npz(checkpoint, {"kind": "checkpoint", "settings": settings, "curve": curve,
@@ -1873,50 +1827,41 @@ def draw_curve(path, curve, title):
         return False
     columns = dict(zip(CURVE, np.array(curve).T))
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-    labels = ({"kl_reward": "rewards", "kl_value": "values"},
-              {"rank_correlation_h0": "Q, h = 0", "rank_correlation_last": "Q, h = H",
-               "rank_correlation_return": "return G"})
-    for ax, lines in zip(axes, labels):
+    for ax, lines in zip(axes, (
+            {"kl_reward": "rewards", "kl_value": "values"},
+            {"rank_correlation_h0": "Q, h = 0", "rank_correlation_last": "Q, h = H",
+             "rank_correlation_return": "return G"})):
         for key, label in lines.items():
             ax.plot(columns["step"], columns[key], label=label)
-        ax.set(xlabel="gradient step", title=title)
+        ax.set(xlabel="gradient step")
         ax.legend()
         ax.grid(alpha=0.3)
-    axes[0].set(yscale="log", ylabel="KL divergence")
+    axes[0].set(yscale="log", ylabel="KL divergence", title=title)
     axes[1].set(ylim=(None, 1), ylabel="rank correlation", title="held-out states")
     save_figure(path, figure)
     return True
 
 
 def read_records(path):
-    """The returns recorded for a model's file, in the .json file beside it: a list of dicts."""
+    """The returns recorded for a model's file, in the .json file beside it, by `record_key`."""
     path = Path(path).with_suffix(".json")
     try:
-        records = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
-        for record in records:
-            record["planner"], record["seed"], record["returns"], record["weights"]
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise UserError(f"{path}: not a file that evaluate --record wrote ({error!r}); delete it "
-                        f"and record anew") from None
-    return records
+        records = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+        return {key: [float(r) for r in returns] for key, returns in records.items()}
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise UserError(f"{path}: not a file that evaluate --record wrote ({error}); delete it and "
+                        f"record anew") from None
 
 
-def record_returns(path, model, found):
-    """Keep what `evaluate` found beside the model's file, one entry for planner and seed."""
-    others = [r for r in read_records(path)
-              if (r["planner"], r["seed"]) != (found["planner"], found["seed"])]
-    record = {key: found[key] for key in ("planner", "seed", "returns")}
+def record_key(model, config, seed):
+    """What recorded returns depend on: weights, planner and the episodes' seed."""
+    return f"weights {checksum(model.params.values())}, evaluation seed {seed}, {config}"
+
+
+def record_returns(path, model, config, seed, returns):
+    """Keep the returns that `evaluate` gave beside the model's file."""
     write_json(Path(path).with_suffix(".json"),
-               [*others, {**record, "weights": checksum(model.params.values())}])
-
-
-def recorded_returns(path, model, config, seed, episodes):
-    """The recorded returns of a model with these weights, planner and episodes, or None."""
-    wanted = asdict(config), seed, checksum(model.params.values())
-    for r in read_records(path):
-        if (r["planner"], r["seed"], r["weights"]) == wanted and len(r["returns"]) >= episodes:
-            return r["returns"][:episodes]
-    return None
+               {**read_records(path), record_key(model, config, seed): returns})
 
 
 def command_distill(args):
@@ -1932,14 +1877,10 @@ def command_distill(args):
     out.mkdir(parents=True, exist_ok=True)
     with contextlib.closing(Distiller(expert, replay, config, args.num_agents,
                                       args.seed)) as distiller:
-        agents = distiller.student.config.num_agents
-        beside = useful_workers(agents) if args.plan_workers is None else args.plan_workers
-        split_agents(agents, beside)  # refuses too many
         result = distil(distiller, args, planning, header, out)
     obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
-    result.update(evaluate_both(expert, path, distiller.student, args, planning, config.q_alone))
-    result.update(time_both(expert, distiller.student, planning, obs, beside,
-                            keep=args.plan_workers is not None))
+    result.update(evaluate_both(expert, path, distiller.student, args, planning))
+    result.update(time_both(expert, distiller.student, planning, obs))
     result["seconds_total"] = round(time.time() - began, 1)
     write_json(out / "result.json", result)
     (out / "checkpoint.npz").unlink(missing_ok=True)
@@ -1966,7 +1907,7 @@ def load_data(args):
 def distil(distiller, args, planning, header, out):
     """Algorithm 1 to its end; writes student, curve and configuration. Returns result's part."""
     student, config, replay = distiller.student, distiller.config, distiller.replay
-    playing = dataclasses.replace(planning, samples=64, iterations=3, q_alone=config.q_alone)
+    playing = dataclasses.replace(planning, samples=64, iterations=3)
     settings = {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
                 "distill": asdict(config),
                 "own_planner": asdict(playing) if config.own_episodes else None,
@@ -1978,53 +1919,47 @@ def distil(distiller, args, planning, header, out):
           f"{replay.transitions:,} transitions; {config.steps:,} steps of {config.batch_size} x "
           f"{config.noise_samples}; results in {out}", file=sys.stderr)
     curve, seconds = train_student(distiller, out, settings, playing, args.workers)
-    rank, returns = rank_correlation(distiller, 256, args.seed, planning.discount)
+    q, g = (x.tolist() for x in rank_correlation(distiller, 256, args.seed, planning.discount))
     save_model(out / "student.npz", student, {"kind": "student", **settings,
                                               "training": header.get("training", {})})
     write_json(out / "config.json", {**settings, "planner": asdict(planning)})
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
             "steps": config.steps, "seconds": round(seconds, 1), "kl_reward": curve[-1][3],
-            "kl_value": curve[-1][4], "rank_correlation": float(rank[0]),
-            "rank_correlation_by_step": rank.tolist(), "out": str(out),
-            "rank_correlation_returns": returns.tolist(),
+            "kl_value": curve[-1][4], "rank_correlation": q[0], "rank_correlation_by_step": q,
+            "rank_correlation_returns": g, "out": str(out),
             "picture": draw_curve(out / "curve.png", curve, f"{args.task}, seed {args.seed}")}
 
 
-def evaluate_both(expert, path, student, args, planning, q_alone):
+def evaluate_both(expert, path, student, args, planning):
     """The student's returns and the expert's, recorded or measured: result's part."""
     where = args.episodes, args.eval_seed, args.workers
-    theirs = evaluate(student, args.task, dataclasses.replace(planning, q_alone=q_alone), *where,
-                      "evaluating the student")["returns"]
-    returns = None if args.evaluate_expert else recorded_returns(path, expert, planning,
-                                                                 args.eval_seed, args.episodes)
-    recorded = returns is not None
-    if not recorded:
-        returns = evaluate(expert, args.task, planning, *where, "evaluating the expert")["returns"]
+    theirs = evaluate(student, args.task, planning, *where, "evaluating the student")["returns"]
+    record = read_records(path).get(record_key(expert, planning, args.eval_seed), [])
+    recorded = len(record) >= args.episodes and not args.evaluate_expert
+    returns = record[:args.episodes] if recorded else evaluate(
+        expert, args.task, planning, *where, "evaluating the expert")["returns"]
     return {"episodes": args.episodes, "expert_recorded": recorded,
             "expert_return_mean": float(np.mean(returns)),
-            "expert_return_std": float(np.std(returns)),
+            "expert_return_std": float(np.std(returns)), "expert_returns": returns,
             "student_return_mean": float(np.mean(theirs)),
-            "student_return_std": float(np.std(theirs)),
-            "kept": return_kept(np.mean(theirs), np.mean(returns)),
-            "student_returns": theirs, "expert_returns": returns}
+            "student_return_std": float(np.std(theirs)), "student_returns": theirs,
+            "kept": return_kept(np.mean(theirs), np.mean(returns))}
 
 
-def time_both(expert, student, planning, obs, beside, keep):
-    """Milliseconds of a decision, both planning alike: result's part.
-
-    Where `beside` workers cost more than they save, the student's are those of one process,
-    unless they are to `keep`."""
+def time_both(expert, student, planning, obs):
+    """Milliseconds of a decision, both planning alike, the student also with a process on each
+    core; where that costs more than it saves, it counts as planning in one. Result's part."""
+    beside = useful_workers(student.config.num_agents)
     with contextlib.ExitStack() as stack:
         planners = [stack.enter_context(Planner(model, planning, workers=workers))
                     for model, workers in ((expert, 0), (student, 0), (student, beside))]
         seconds = interleaved_seconds([functools.partial(p.act, obs) for p in planners], 20,
                                       "timing")
     central, alone, parallel = (1e3 * np.median(seconds, 0)).tolist()
-    if not beside or (not keep and parallel >= alone):
-        beside, parallel = 0, alone
-    return {"plan_ms_expert": central, "plan_ms_expert_own": central, "plan_ms_student": parallel,
-            "speedup": central / parallel,
-            "plan_ms_student_in_process": alone, "plan_workers": beside}
+    fastest = min(alone, parallel)
+    return {"plan_ms_expert": central, "plan_ms_expert_own": central, "plan_ms_student": fastest,
+            "speedup": central / fastest, "plan_ms_student_in_process": alone,
+            "plan_workers": beside if parallel < alone else 0}
 
 
 def report(result, planning, eval_seed):
@@ -2071,14 +2006,14 @@ def command_evaluate(args):
     made_for = {"discount": trained_discount(header, args.model)}
     if "distill" in header:
         config = from_dict(DistillConfig, header["distill"], args.model)
-        made_for.update(horizon=config.horizon, q_alone=config.q_alone)
+        made_for["horizon"] = config.horizon
     planning, task = from_args(PlannerConfig, args, **made_for), args.task or header.get("task")
     need(task == header.get("task") or not args.record, f"{args.model}: header: task: expected "
          f"{task!r} to record its returns, found {header.get('task')!r}")
     found = evaluate(model, task, planning, args.episodes, args.seed, args.workers)
-    if args.record:
-        record_returns(args.model, model, found)
     returns, ms = found["returns"], found["plan_ms_median"]
+    if args.record:
+        record_returns(args.model, model, planning, args.seed, returns)
     mean, std = float(np.mean(returns)), float(np.std(returns))
     print_table([("task", "episodes", "return", "min", "max", "ms a decision"),
                  (task, str(args.episodes), f"{mean:.0f} ± {std:.0f}", f"{min(returns):.0f}",
@@ -2162,13 +2097,11 @@ def make_parser():
     add("--replay", help="replay file [data/TASK/replay.npz]")
     add("--out", help="folder for the results [runs/TASK-SEED]")
     add("--eval-seed", type=natural, default=0, help="of the evaluation episodes [0]")
-    add("--plan-workers", type=natural, help="processes beside this one that plan for a part of "
-        "the agents, where planning is timed [one for every further core if that is faster]")
     add("--evaluate-expert", action="store_true",
         help="measure the expert's return anew instead of reading its record")
     add_playing(sub)
     add_config(sub, DistillConfig)
-    add_config(sub, PlannerConfig, prefix="plan-", skip=("horizon", "q_alone"))
+    add_config(sub, PlannerConfig, prefix="plan-", skip=("horizon",))
 
     sub = add_command(commands, "evaluate", command_evaluate, "Plan with a model (expert or "
                       "student) through whole episodes.")

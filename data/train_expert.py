@@ -65,7 +65,7 @@ class Episode:
     def play(self, planner, decisions):
         """Go on with a planner, whose actions get exploration noise, or with None: at random."""
         if planner and self._warm_start:
-            planner.own.mean, planner.own.rngs, planner.own.t = self._warm_start
+            planner.own.mean, planner.own.rngs = self._warm_start
         elif planner:
             planner.reset(self.seed)
         for _ in range(decisions):
@@ -74,7 +74,7 @@ class Episode:
             self.observation.append(obs)
             self.reward.append(reward)
         own = planner and planner.own
-        self._warm_start = own and (own.mean, own.rngs, own.t)
+        self._warm_start = own and (own.mean, own.rngs)
 
     def _explore(self, planner):
         if planner is None:
@@ -365,8 +365,7 @@ class Training:
         """How the expert or its student plans: a student as it was distilled to."""
         if name == "expert":
             return planning
-        return dataclasses.replace(planning, horizon=self.student.config.horizon,
-                                   q_alone=self.student.config.q_alone)
+        return dataclasses.replace(planning, horizon=self.student.config.horizon)
 
     def learn(self):
         """One update of the expert and, on the same batch, one of the student; their LOSSES."""
@@ -562,10 +561,11 @@ def export(training, out, result):
         fac.save_model(out / f"{kind}.npz", model, header)
         if args.episodes:
             planning = fac.PlannerConfig(horizon=config.horizon, discount=config.discount)
-            found = fac.evaluate(model, args.task, training.planner_of(kind, planning),
-                                 args.episodes, label=f"evaluating the {kind}")
-            fac.record_returns(out / f"{kind}.npz", model, found)
+            planner = training.planner_of(kind, planning)
+            found = fac.evaluate(model, args.task, planner, args.episodes,
+                                 label=f"evaluating the {kind}")
             returns = found["returns"]
+            fac.record_returns(out / f"{kind}.npz", model, planner, 0, returns)
             mean, std = float(np.mean(returns)), float(np.std(returns))
             result.update({f"{prefix}return_mean": mean, f"{prefix}return_std": std,
                            f"{prefix}returns": returns})
@@ -639,7 +639,7 @@ def make_parser():
     add("--json", action="store_true", help="print one JSON object as the last line of stdout")
     fac.add_config(parser, TrainingConfig, **TRAINING_DEFAULTS)
     fac.add_config(parser, fac.PlannerConfig, "MPPI while training", "plan-",
-                   skip=("discount", "q_alone"))
+                   skip=("discount",))
     fac.add_config(parser, fac.DistillConfig, "The student (Algorithm 1), on the expert's batches "
                    "and steps", "distill-", skip=("steps", "batch_size", "reuse", "new_targets",
                                                   "own_episodes", "own_share", "held_out"),

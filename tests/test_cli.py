@@ -160,7 +160,7 @@ def test_every_setting_has_a_flag_in_help():
                                           ("evaluate", fac.PlannerConfig, "")):
         text = subparsers[command].format_help()
         for f in dataclasses.fields(config_class):
-            name = f.name if f.name in ("horizon", "q_alone") else prefix + f.name
+            name = f.name if f.name == "horizon" else prefix + f.name
             assert f"--{name}".replace("_", "-") in text
 
 
@@ -199,7 +199,7 @@ def test_preset_paper_is_the_paper(monkeypatch):
                 "kl": "reverse", "encoder_input": "observation", "lr": 1e-4,
                 "lr_schedule": "constant", "warmup": 0, "grad_clip": 10, "sizes": "table2",
                 "noise_std": 0.5, "noise_std_min": 0.5, "clip_actions": False, "new_targets": 0,
-                "reuse": 1, "own_episodes": 0, "own_share": 0, "q_alone": 0}
+                "reuse": 1, "own_episodes": 0, "own_share": 0}
     assert {k: found[k] for k in expected} == expected
     assert (planner.samples, planner.iterations, planner.num_elites, planner.pi_trajs,
             planner.horizon, planner.discount) == (512, 6, 64, 24, 3, 0.99)
@@ -228,7 +228,7 @@ def another_value(f):
     (fac.PlannerConfig, "", ["evaluate", "--model", "x"])])
 def test_every_flag_reaches_its_setting(monkeypatch, config_class, prefix, start):
     for f in dataclasses.fields(config_class):
-        if prefix and f.name in ("horizon", "q_alone"):
+        if prefix and f.name == "horizon":
             continue  # distill has one for loss and planning
         (flag, *rest), value = another_value(f)
         flag = f"--no-{prefix}{flag[3:]}" if flag.startswith("no-") else f"--{prefix}{flag}"
@@ -291,7 +291,6 @@ def refused(done, *parts, program="fac_tdmpc_ref.py"):
     (["--plan-momentum", "5"], ["momentum", "at most 1"]),
     (["--episodes", "0"], ["episodes", "at least 1"]),
     (["--workers", "-1"], ["--workers", "-1"]),
-    (["--plan-workers", "3"], ["3 workers", "0 to 2"]),
     (["--seed", "-1"], ["--seed", "-1"]),
     (["--eval-seed", "x"], ["--eval-seed", "'x'"]),
     (["--stepz", "3"], ["--stepz"]),
@@ -582,7 +581,7 @@ def test_models_plan_with_the_discount_they_were_trained_with(tmp_path, files, c
     fac.save_model(tmp_path / "expert.npz", model, {**header, "training": {"discount": discount}})
     seen, evaluate = [], fac.evaluate
     arguments = distill_arguments(files, "--expert", tmp_path / "expert.npz", "--out",
-                                  tmp_path / "out", "--plan-workers", "0")
+                                  tmp_path / "out")
     evaluations = [["evaluate", "--model", tmp_path / path] for path in ("expert.npz",
                                                                          "out/student.npz")]
     with pytest.MonkeyPatch.context() as patch:
@@ -609,9 +608,9 @@ def test_recorded_returns_stand_for_the_expert_in_distill(tmp_path, files, no_pl
     done = run("evaluate", "--model", expert, "--task", "reacher-hard", "--episodes", "2",
                "--workers", "1", "--record", "--json", "--horizon", "1", *BUDGET, cwd=tmp_path)
     measured = last_json(done)
-    (record,) = fac.read_records(expert)
-    assert record["returns"] == measured["returns"]
-    assert record["seed"] == 0 and record["planner"]["samples"] == 16
+    ((key, returns),) = fac.read_records(expert).items()
+    assert returns == measured["returns"]
+    assert "evaluation seed 0" in key and "samples=16" in key
 
     arguments = distill_arguments(files, "--expert", expert, "--num-agents", "1", "--out", "out")
     done = succeeded(run(*arguments, "--workers", "0", cwd=tmp_path, env=no_plots))
@@ -653,27 +652,21 @@ def test_a_student_plans_over_the_horizon_it_was_distilled_over(tmp_path, files,
     assert seen == [2, 2, 2, 0]
 
 
-@pytest.mark.parametrize("config, episodes, expected", [
-    ({}, (5, 3), [1.0, 2.0, 3.0]), ({}, (5, 2), [1.0, 2.0]), ({}, (5, 4), None),
-    ({}, (6, 2), None), ({"samples": 511}, (5, 1), None), ({"samples": 7}, (5, 1), [4.0]),
-    ({"output": "mean"}, (5, 1), None)])
-def test_a_record_counts_for_its_own_episodes_and_planner_only(tmp_path, config, episodes,
-                                                               expected):
-    """episodes: evaluation seed and how many."""
-    path, model = tmp_path / "expert.npz", random_model()
-    assert fac.recorded_returns(path, model, fac.PlannerConfig(), *episodes) is None
-    for planner, returns in (({}, [1.0, 2.0, 9.0]), ({"samples": 7}, [4.0, 5.0, 6.0]),
-                             ({}, [1.0, 2.0, 3.0])):  # the last replaces the first
-        fac.record_returns(path, model, {
-            "returns": returns, "seed": 5, "plan_ms_median": 1.0,
-            "planner": dataclasses.asdict(fac.PlannerConfig(**planner))})
-    assert len(fac.read_records(path)) == 2
-    assert fac.recorded_returns(path, model, fac.PlannerConfig(**config), *episodes) == expected
-    other = random_model(seed=1)
-    assert fac.recorded_returns(path, other, fac.PlannerConfig(**config), *episodes) is None
+def test_a_record_counts_for_its_own_weights_planner_and_episodes_only(tmp_path):
+    path, model, config = tmp_path / "expert.npz", random_model(), fac.PlannerConfig()
+    assert fac.read_records(path) == {}
+    fac.record_returns(path, model, config, 5, [1.0, 2.0])
+    fac.record_returns(path, model, config, 5, [3.0])  # replaces it
+    fac.record_returns(path, model, fac.PlannerConfig(samples=7), 5, [4.0])
+    keys = [fac.record_key(*which) for which in (
+        (model, config, 5), (model, fac.PlannerConfig(samples=7), 5), (model, config, 6),
+        (model, fac.PlannerConfig(output="mean"), 5), (random_model(seed=1), config, 5))]
+    found = fac.read_records(path)
+    assert [found.pop(key, None) for key in keys] == [[3.0], [4.0], None, None, None]
+    assert not found
 
 
-@pytest.mark.parametrize("text", ["{", "[{}]", "[3]", '"x"'])
+@pytest.mark.parametrize("text", ["{", "[3]", '"x"', '{"a": 1}', '{"a": ["x"]}'])
 def test_a_spoilt_record_is_named(tmp_path, text):
     (tmp_path / "expert.json").write_text(text)
     with pytest.raises(fac.UserError, match="expert.json: not a file that evaluate --record wrote"):

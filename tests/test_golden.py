@@ -9,6 +9,7 @@ import pytest
 
 import fac_tdmpc_ref as fac
 from export_golden import digest
+from test_layers import UNSEEN
 
 TASKS = sorted(p.parent.name for p in fac.DATA.glob("*/golden.npz"))
 FORWARD, GRADIENT, ADAM = 1e-5, 1e-4, 1e-5  # relative to the largest entry, or to the norm
@@ -118,7 +119,7 @@ def test_kl_loss_and_gradients(golden):
     loss, _, _ = fac.distill_loss(student, *batch, config, grads)
     assert abs(loss / g["kl_loss"] - 1) < FORWARD
     for key, gradient in grads.items():
-        if key in fac.UNSEEN:
+        if key in UNSEEN:
             assert np.abs(gradient).max() < 1e-6
         else:
             assert_digest(gradient, g[f"kl_grad {key}"], GRADIENT)
@@ -135,7 +136,7 @@ def test_ten_adam_steps(golden, dtype):
     batch.append([(t - t.mean(-1, keepdims=True)).astype(dtype) for t in targets])
     views, _ = ten_steps(student, batch, config, config.lr, g["adam_losses"])
     for key, value in views.items():
-        if key.endswith("weight") or (dtype == np.float64 and key not in fac.UNSEEN):
+        if key.endswith("weight") or (dtype == np.float64 and key not in UNSEEN):
             assert_digest(value, g[f"adam {key}"], ADAM)
 
 
@@ -165,7 +166,7 @@ def test_narrow_students(n, kind, dtype):
 
     def check_gradients(grads):
         for key, found in grads.items():
-            if key in fac.UNSEEN:
+            if key in UNSEEN:
                 assert np.abs(found).max() < 1e-6
             else:
                 assert relative(found, g[f"grad {key}"]) < GRADIENT, key
@@ -173,7 +174,7 @@ def test_narrow_students(n, kind, dtype):
     views, clipped = ten_steps(student, batch, config, 1e-3, g["adam_losses"], check_gradients)
     assert clipped, "the case should clip"
     for key, found in views.items():
-        if key.endswith("weight") or (dtype == np.float64 and key not in fac.UNSEEN):
+        if key.endswith("weight") or (dtype == np.float64 and key not in UNSEEN):
             assert relative(found, g[f"adam {key}"]) < ADAM, key
 
 
@@ -215,7 +216,7 @@ def settings_of(config_class, header, name):
 
 def assert_same(found, stored, tolerance):
     for key, value in found.items():
-        if not key.endswith(tuple(fac.UNSEEN)):
+        if not key.endswith(tuple(UNSEEN)):
             assert relative(np.asarray(value).reshape(stored[key].shape), stored[key]) < tolerance
 
 

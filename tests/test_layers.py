@@ -8,6 +8,10 @@ from hypothesis import strategies as st
 
 import fac_tdmpc_ref as fac
 
+# A softmax doesn't see a constant, so these have no gradient but rounding errors, and Adam lets
+# them wander. Planning doesn't see a constant either.
+UNSEEN = ("_reward.4.bias", "_Q1.5.bias", "_Q2.5.bias")
+
 SHAPES = [(1, 5, 4, 1), (1, 3, 7, 6), (3, 4, 5, 2), (2, 6, 3, 1)]  # N, in, out, B
 
 
@@ -125,7 +129,7 @@ def test_distill_loss_through_the_rollout(n, batch, steps, kind, latent):
     for key, value in student.params.items():
         expected = numeric_gradient(lambda: fac.distill_loss(student, *case)[0], value)
         assert_close(grads[key], expected, 1e-5)
-        if not (key.startswith("_expert") or key in fac.UNSEEN) and steps > 1:
+        if not (key.startswith("_expert") or key in UNSEEN) and steps > 1:
             assert np.abs(expected).max() > 1e-7, f"{key}: the check compares zeros"
 
 

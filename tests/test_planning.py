@@ -1,5 +1,4 @@
 """MPPI on problems with known answers, Proposition 1, the fast returns, and the workers."""
-import copy
 import os
 import signal
 import subprocess
@@ -369,28 +368,3 @@ def test_cores_are_those_this_process_may_use(monkeypatch):
     assert fac.cores() == 3 and fac.useful_workers(6) == 2
     monkeypatch.delattr(os, "sched_getaffinity")
     assert fac.cores() == 64
-
-
-def test_q_alone_plans_the_first_decisions_of_every_200():
-    """The others, as without it: from an empty warm start where Q's turn ends."""
-    model, obs = random_model(), np.ones(8, np.float32)
-    base = fac.PlannerConfig(samples=16, iterations=2, horizon=2)
-    configs = {"alone": fac.dataclasses.replace(base, horizon=0), "ahead": base,
-               "turns": fac.dataclasses.replace(base, q_alone=3)}
-    z = model.encode(obs[:, None])
-    planners = {name: fac.AgentPlanner(model, config) for name, config in configs.items()}
-    for planner in planners.values():
-        planner.reset(np.random.SeedSequence(0).spawn(3))
-    planner = planners["turns"]
-    for t in range(203):
-        before = planner.mean.copy()
-        alone = planners["alone" if t % 200 < 3 else "ahead"]
-        alone.mean[:] = before[:, :alone.mean.shape[1]]
-        alone.rngs = copy.deepcopy(planner.rngs)
-        assert np.array_equal(planner.plan(z), alone.plan(z)), t
-        if t % 200 < 3:
-            assert not planner.mean.any()
-        else:
-            assert np.array_equal(planner.mean, alone.mean)
-    planner.reset([])
-    assert planner.t == 0
