@@ -4,9 +4,9 @@ A TD-MPC expert (encoder, dynamics, reward, value; planning by MPPI in latent sp
 into a student whose latent state, dynamics, reward and value fall apart into one small model for
 each action dimension. Each joint then plans alone: cheaper, and in parallel. What that keeps of
 the return is measured, in the README. This file holds the method: networks with hand-written
-gradients, Adam, TD-MPC's Equation 1, Algorithm 1 (Equation 4), MPPI (Equations 2 and 3), planning
-workers, environments, files and two commands. What uses the method is in data/: training experts,
-the paper's experiments, checkpoints from elsewhere.
+gradients, Adam, Algorithm 1 (Equation 4), MPPI (Equations 2 and 3), planning workers,
+environments, files and two commands. What uses it is in data/: training experts (Equation 1), the
+paper's experiments, checkpoints from elsewhere.
 
     python fac_tdmpc_ref.py distill --task reacher-hard
     python fac_tdmpc_ref.py evaluate --model runs/reacher-hard-0/student.npz
@@ -26,10 +26,10 @@ A layer is W (N, out, in), b (N, out, 1) and computes W @ x + b on x (N, in, B):
 that activations run over long contiguous rows, and a torch Linear.weight goes in as weight[None].
 Rewards and values come out as (N, B), agent i's share; the global one is their sum over N.
 
-Read it from top to bottom: 1 configuration, 2 layers, 3 world model, 4 Equation 1,
-5 distillation, 6 planning, 7 environments, 8 files, 9 commands. A first reading may skip what is
-marked "the same, fast" and "the same, in processes" in section 6. Departures from the paper are
-tagged [D1], [D2], ...; the README lists them with what each bought.
+Read it from top to bottom: 1 configuration, 2 layers, 3 world model, 4 distillation, 5 planning,
+6 environments, 7 files, 8 commands. A first reading may skip what is marked "the same, fast" and
+"the same, in processes" in section 5. Departures from the paper are tagged [D1], [D2], ...; the
+README lists them with what each bought.
 """
 from __future__ import annotations
 
@@ -50,6 +50,7 @@ import sys
 import tempfile
 import time
 import zlib
+from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -209,25 +210,6 @@ class DistillConfig(Settings):
             self.refuse("noise_std", f"at least noise_std_min ({self.noise_std_min})")
 
 
-@dataclass(frozen=True)
-class ExpertConfig(Settings):
-    """TD-MPC's learning: Equation 1 and the sizes of its networks."""
-    latent_dim: int = field(50, "m: latent features (Table 2)", least=1)
-    enc_dim: int = field(256, "hidden width of the encoder (Table 2)", least=1)
-    mlp_dim: int = field(512, "hidden width of the other networks (Table 2)", least=1)
-    horizon: int = field(3, "H: steps of the latent rollout (Table 2)", least=1, most=EPISODE_STEPS)
-    batch_size: int = field(512, "segments in an update (Table 2)", least=1)
-    lr: float = field(5e-4, "Adam's learning rate (authors' expert)", above=0)
-    discount: float = field(0.99, "gamma (Table 2)", least=0, most=1)
-    lam: float = field(0.5, "lambda of Equation 1 (rho in Table 2)", least=0)
-    consistency_coef: float = field(2.0, "weight of the latent term (TD-MPC)", least=0)
-    reward_coef: float = field(0.5, "weight of the reward term (Table 2)", least=0)
-    value_coef: float = field(0.1, "weight of the value term (Table 2)", least=0)
-    grad_clip: float = field(10.0, "largest gradient norm (Table 2)", above=0)
-    tau: float = field(0.01, "step of the moving-average targets (Table 2)", least=0, most=1)
-    target_every: int = field(2, "updates between two steps of the targets (TD-MPC)", least=1)
-
-
 def stream(seed, use, index=0):
     """The Generator of one use of a run's seed: no two uses, or indices of one, share numbers."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(
@@ -385,14 +367,6 @@ def flatten(arrays):
                     for (k, a), end in zip(arrays.items(), ends)}
 
 
-def clip_norm(gradient, largest):
-    """Scale a gradient vector in place so that its norm is at most `largest`; returns the norm."""
-    length = float(np.sqrt(np.dot(gradient, gradient)))
-    if length > largest:
-        gradient *= gradient.dtype.type(largest / (length + 1e-6))  # PyTorch's 1e-6
-    return length
-
-
 class Adam:
     """Adam as PyTorch defines it, with clipping, on a dict of arrays: all of them views of one
     vector, so that a step is a few vector calls. Add to `grads`, then `step`."""
@@ -407,7 +381,9 @@ class Adam:
         """params -= lr m_hat / (sqrt(v_hat) + eps) of the gradient, clipped to norm `clip`.
 
         Sets the gradient to zero again; returns its norm."""
-        length, (beta1, beta2) = clip_norm(self.gradient, clip), self.betas
+        length, (beta1, beta2) = float(np.linalg.norm(self.gradient)), self.betas
+        if length > clip:
+            self.gradient *= self.gradient.dtype.type(clip / (length + 1e-6))  # PyTorch's 1e-6
         self.t += 1
         self.m += (1 - beta1) * (self.gradient - self.m)
         self.v += (1 - beta2) * (self.gradient ** 2 - self.v)
@@ -552,15 +528,10 @@ def unroll(model, z, actions, transitions, tapes=None):
     end = None
     for h in range(transitions):
         end = forward(MLP, model.params, "_dynamics", x[:, :, h * columns:(h + 1) * columns],
-                      keep(tapes, f"_dynamics {h}"))
+                      None if tapes is None else tapes[f"_dynamics {h}"])
         if h < steps - 1:
             x[:, :m, (h + 1) * columns:(h + 2) * columns] = end
     return x, end
-
-
-def keep(tapes, name):
-    """The list in the dict `tapes` that a backward pass finds under `name`; None without tapes."""
-    return None if tapes is None else tapes.setdefault(name, [])
 
 
 def predict(model, z, actions, tapes=None):
@@ -572,7 +543,7 @@ def predict(model, z, actions, tapes=None):
 def run_heads(model, x, actions, tapes=None):
     """Global reward and both Q of `unroll`'s x: the sums over agents, three (L, B, K)."""
     steps, _, batch, noise = actions.shape
-    return [forward(kinds, model.params, name, x, keep(tapes, name)).sum(0)
+    return [forward(kinds, model.params, name, x, None if tapes is None else tapes[name]).sum(0)
             .reshape(steps, batch, noise) for name, kinds in HEADS]
 
 
@@ -598,122 +569,7 @@ def predict_backward(model, tapes, d_outputs, grads, d_latents=None):
     return dx[:, :m, :columns].reshape(n, m, batch, noise).sum(3)
 
 
-# ==== 4. TD-MPC's objective, Equation 1 ===============================================
-
-POLICY_STD, POLICY_CUT = 0.05, 0.3  # TD-MPC's policy noise: its deviation, and where it is cut
-
-
-def policy_noise(shape, rng):
-    """What TD-MPC adds to its policy's actions, where it learns and where it proposes."""
-    return np.clip(rng.standard_normal(shape, F32) * F32(POLICY_STD), -POLICY_CUT, POLICY_CUT)
-
-
-def td_targets(model, target, obs, reward, noise, discount):
-    """What Equation 1 holds fixed: latents of the moving-average encoder, and TD targets.
-
-    obs (H, O, B): the observation after each action; reward (H, B); noise (A, H * B): the
-    policy's. Returns (1, m, H * B), columns ordered (H, B), and the targets
-    r_h + gamma min(Q1, Q2)(s_{h+1}, pi(s_{h+1})) (H, B) with the moving averages of Q."""
-    after = np.ascontiguousarray(obs.swapaxes(0, 1)).reshape(obs.shape[1], -1)
-    z = model.encode(after)
-    q = np.minimum(*target.q(z, np.clip(model.policy(z) + noise, -1, 1)))
-    return target.encode(after), reward + discount * q.reshape(reward.shape)
-
-
-def equation_1(model, obs, actions, reward, latents, td, config, grads=None):
-    """Equation 1 and, into the dict `grads`, its gradients.
-
-        1/H sum_{h=0}^{H-1} lambda^h [c_T |s_{h+1} - latents_h|^2 + c_R (r_h - reward_h)^2
-                            + c_Q ((Q1_h - td_h)^2 + (Q2_h - td_h)^2)],  means over B and m,
-
-    as TD-MPC's code has it (the paper prints h = 0..H, no 1/H, and norms).
-
-    obs (O, B): the first ones; actions (H, A, B); reward (H, B); latents and td from `td_targets`.
-    Returns the loss, its three sums over h without coefficients, and the rollout s_0, ..., s_H
-    (1, m, (H + 1) * B)."""
-    steps, _, batch = actions.shape
-    tapes, encoder_tape, actions = {}, [], actions[..., None]           # K = 1
-    z = model.encode_features(obs[None], encoder_tape)
-    x, end = unroll(model, z, actions, steps, tapes)
-    rollout = np.concatenate([x[:, :z.shape[1]], end], 2)
-    weights = (config.lam ** np.arange(steps) / batch).astype(z.dtype)[:, None]
-    terms, d_outputs = [], []
-    coefs = (config.reward_coef, config.value_coef, config.value_coef)
-    for coef, output, goal in zip(coefs, run_heads(model, x, actions, tapes), (reward, td, td)):
-        error = output[..., 0] - goal
-        terms.append(float((weights * error ** 2).sum()))
-        d_outputs.append((2 * coef / steps * weights * error)[..., None])
-    gap = (rollout[:, :, batch:] - latents).reshape(*z.shape[:2], steps, batch)
-    weights = weights / z.shape[1]
-    terms.insert(0, float((weights * gap ** 2).sum()))
-    terms = [terms[0], terms[1], terms[2] + terms[3]]
-    loss = np.dot(terms, [config.consistency_coef, config.reward_coef, config.value_coef]) / steps
-    if grads is not None:
-        d_latents = 2 * config.consistency_coef / steps * weights * gap
-        dz = predict_backward(model, tapes, d_outputs, grads, d_latents.transpose(2, 0, 1, 3))
-        backward(ENCODER, model.params, "_encoder", encoder_tape, dz, grads)
-    return float(loss), terms, rollout
-
-
-def policy_loss(model, rollout, noise, lam, grads):
-    """- sum_h lambda^h mean over B of min(Q1, Q2)(s_h, pi(s_h) + noise); gradients for `_pi` only.
-
-    rollout (1, m, L * B): the latents of `equation_1`, held fixed; noise (A, L, B). The clipping
-    of the noisy action to [-1, 1] lets gradients through, as in TD-MPC's code."""
-    tape, q_tapes, (dim_action, steps, batch) = [], ([], []), noise.shape
-    mu = np.tanh(forward(MLP, model.params, "_pi", rollout, tape))
-    a = np.clip(mu + noise.reshape(1, dim_action, -1), -1, 1)
-    x = np.concatenate([rollout, a], 1)
-    q1, q2 = (forward(QNET, model.params, name, x, q_tape)
-              for name, q_tape in zip(("_Q1", "_Q2"), q_tapes))
-    weights = np.repeat(lam ** np.arange(steps) / batch, batch).astype(x.dtype)
-    first = np.where(q1 == q2, F32(0.5), q1 < q2).astype(x.dtype)  # a tie counts half for each
-    da = 0
-    for name, q_tape, smaller in (("_Q1", q_tapes[0], first), ("_Q2", q_tapes[1], 1 - first)):
-        dx = backward(QNET, model.params, name, q_tape, -weights * smaller, None)
-        da = da + dx[:, rollout.shape[1]:]
-    backward(MLP, model.params, "_pi", tape, tanh_backward(da, mu), grads)
-    return -float((weights * np.minimum(q1, q2)).sum())
-
-
-class Learner:
-    """TD-MPC: the model, its moving averages, and what an `update` of them takes."""
-
-    def __init__(self, sizes, config, rng, dtype=F32):
-        model = WorldModel.create(sizes, rng, policy=True, dtype=dtype)
-        policy = {k: v for k, v in model.params.items() if k.startswith("_pi")}
-        self.config = config
-        self.optimizer = Adam({k: v for k, v in model.params.items() if k not in policy})
-        self.policy_optimizer = Adam(policy)
-        self.model = WorldModel(sizes, {**self.optimizer.params, **self.policy_optimizer.params})
-        self.slow_vector, slow = flatten(self.optimizer.params)
-        self.target = WorldModel(sizes, slow)
-
-    def update(self, obs, actions, reward, rng):
-        """One step of Equation 1, one of the policy; every `target_every` times the averages.
-
-        obs (H + 1, O, B), actions (H, A, B), reward (H, B). Returns the three terms of Equation 1
-        and the latents s_0, ..., s_H (1, m, (H + 1) * B)."""
-        config, (steps, dim_action, batch) = self.config, actions.shape
-        noise = policy_noise((dim_action, 2 * steps + 1, batch), rng)
-        latents, td = td_targets(self.model, self.target, obs[1:], reward,
-                                 noise[:, :steps].reshape(dim_action, -1), config.discount)
-        _, terms, rollout = equation_1(self.model, obs[0], actions, reward, latents, td, config,
-                                       self.optimizer.grads)
-        self.optimizer.step(config.lr, config.grad_clip)
-        policy_loss(self.model, rollout, noise[:, steps:], config.lam, self.policy_optimizer.grads)
-        self.policy_optimizer.step(config.lr, config.grad_clip)
-        if self.updates % config.target_every == 0:  # averages += tau (weights - averages)
-            self.slow_vector += config.tau * (self.optimizer.vector - self.slow_vector)
-        return terms, rollout
-
-    @property
-    def updates(self):
-        """Updates made so far."""
-        return self.optimizer.t
-
-
-# ==== 5. Model distillation (section 4.4, Algorithm 1, Equation 4) ====================
+# ==== 4. Model distillation (section 4.4, Algorithm 1, Equation 4) ====================
 
 def log_softmax(x):
     """log of exp(x) / sum exp(x) over the last axis."""
@@ -745,7 +601,7 @@ def distill_loss(student, features, actions, targets, config, grads=None):
     features (1, F, B): what the student's encoder reads in the first states; actions
     (L, A, B, K): perturbed; targets: the expert's `predict` for them. Returns the loss and
     the mean divergences of reward and value over steps and states."""
-    tapes, encoder_tape = {}, []
+    tapes, encoder_tape = defaultdict(list), []
     z = student.encode_features(features, encoder_tape)
     outputs = predict(student, z, actions, tapes)
     steps, batch, _ = outputs[0].shape
@@ -950,7 +806,7 @@ def rank_correlation(distiller, states, seed, discount=0.99):
             spearman(*(horizon_returns(*out, discount) for out in (expert, own))).mean(-1))
 
 
-# ==== 6. Planning: MPPI (Equations 2 and 3), then the worker processes ================
+# ==== 5. Planning: MPPI (Equations 2 and 3), then the worker processes ================
 
 
 def h_step_return(model, z, actions, config):
@@ -1004,6 +860,14 @@ def mppi(returns, mean, config, rngs, proposals=None):
         std = np.clip(std, config.min_std, config.max_std)
         mean = config.momentum * mean + (1 - config.momentum) * new
     return mean[..., 0], elites, scores
+
+
+POLICY_STD, POLICY_CUT = 0.05, 0.3  # TD-MPC's policy noise: its deviation, and where it is cut
+
+
+def policy_noise(shape, rng):
+    """What TD-MPC adds to its policy's actions, where it learns and where it proposes."""
+    return np.clip(rng.standard_normal(shape, F32) * F32(POLICY_STD), -POLICY_CUT, POLICY_CUT)
 
 
 class AgentPlanner:
@@ -1082,11 +946,6 @@ class Planner(contextlib.AbstractContextManager):
                 self._workers.send(i, z[part])
             own = self.own.plan(z[self._parts[0]])
             return np.concatenate([own, *self._workers.receive_all()]).reshape(-1)
-
-    def hand_over(self):
-        """Wake all workers and wait for their answers, without planning: what `act` pays."""
-        self._workers.send_all(None)
-        self._workers.receive_all()
 
     def close(self):
         """End the worker processes."""
@@ -1231,7 +1090,7 @@ def _planning_worker(connection):
         if isinstance(message, list):
             planner.reset(message)
         else:
-            connection.send(None if message is None else planner.plan(message))
+            connection.send(planner.plan(message))
 
 
 class WorkerError(UserError):
@@ -1327,7 +1186,7 @@ def one_thread():
     return _thread_pools().limit(limits=1, user_api="blas")
 
 
-# ==== 7. Environments (appendix B.1) ==================================================
+# ==== 6. Environments (appendix B.1) ==================================================
 
 # paper's name: (dm_control domain, task, dim O, dim A); the dimensions are Figure 3's
 TASKS = {
@@ -1459,7 +1318,7 @@ def renew_targets(task, obs, share, rng):
         obs[3:5, chosen] = draw_targets(obs[:, chosen], rng)
 
 
-# ==== 8. Files: weights, replay, replay buffer ========================================
+# ==== 7. Files: weights, replay, replay buffer ========================================
 
 DATA = Path(__file__).resolve().parent / "data"
 FORMAT = "fac-tdmpc-ref 1"
@@ -1503,12 +1362,10 @@ def read_npz(path, kind):
                         ) from None
     try:
         header = json.loads(arrays.pop("header").tobytes())
-        if not isinstance(header, dict):
-            raise ValueError
-    except (KeyError, ValueError):
-        raise UserError(f"{path}: header: expected a JSON entry of this name, found none; "
-                        f"files of this project are made by data/train_expert.py and distill"
-                        ) from None
+        need(isinstance(header, dict), "")
+    except (KeyError, ValueError, UserError):
+        raise UserError(f"{path}: header: expected a JSON entry of this name, found none; files "
+                        f"are made by data/train_expert.py and distill") from None
     need(header.get("format") == FORMAT, f"{path}: header: format: expected {FORMAT!r}, found "
          f"{header.get('format')!r}; make the file anew with this version")
     need(header.get("kind") in kind, f"{path}: header: kind: expected {' or '.join(kind)}, found "
@@ -1547,13 +1404,16 @@ def load_model(path):
     return WorldModel(config, params), header
 
 
-def trained_discount(header, where):
-    """gamma of a model's Q, or of its expert's: what it plans with; 0.99 if its file is silent."""
-    training = header.get("training") or {}
-    found = training.get("discount", 0.99) if isinstance(training, dict) else training
-    need(isinstance(found, (int, float)) and 0 <= found <= 1, f"{where}: header: training: "
-         f"discount: expected a number between 0 and 1, found {found!r}")
-    return float(found)
+def made_for(header, where):
+    """The discount and the horizon that a model's file was trained, or distilled, for."""
+    found = {}
+    for group, name in (("training", "discount"), ("distill", "horizon")):
+        settings = header.get(group) or {}
+        need(isinstance(settings, dict), f"{where}: header: {group}: expected settings, found "
+             f"{settings!r}")
+        found.update({name: settings[name]} if name in settings else {})
+    from_dict(PlannerConfig, found, f"{where}: header")
+    return found
 
 
 class Replay:
@@ -1614,14 +1474,13 @@ def data_file(task, name):
     path = DATA / task / name
     if not path.exists():
         shipped = ", ".join(sorted(p.parent.name for p in DATA.glob("*/expert.npz"))) or "none"
-        raise UserError(f"{path}: no such file; experts are at hand for: {shipped} (the "
-                        f"repository holds them, a pip install doesn't). Train one with "
-                        f"'python data/train_expert.py --task {task}' in a checkout of the "
-                        f"repository, or name files with --expert and --replay")
+        raise UserError(f"{path}: no such file; the repository (a pip install doesn't) holds "
+                        f"{shipped}. Train one with 'python data/train_expert.py --task {task}' "
+                        f"there, or name files with --expert and --replay")
     return path
 
 
-# ==== 9. Commands =====================================================================
+# ==== 8. Commands =====================================================================
 
 
 def decisions(model, task, config, seeds):
@@ -1869,10 +1728,9 @@ def command_distill(args):
     began = time.time()
     preset = paper_preset if args.preset == "paper" else lambda config: {}
     config = from_args(DistillConfig, args, **preset(DistillConfig))
-    made_for = {**preset(PlannerConfig), "horizon": config.horizon}
-    from_args(PlannerConfig, args, **made_for)  # wrong settings first, then wrong files
     expert, header, replay, path = load_data(args)
-    planning = from_args(PlannerConfig, args, discount=trained_discount(header, path), **made_for)
+    planning = from_args(PlannerConfig, args, **{
+        **preset(PlannerConfig), **made_for(header, path), "horizon": config.horizon})
     out = Path(args.out or f"runs/{args.task}-{args.seed}")
     out.mkdir(parents=True, exist_ok=True)
     with contextlib.closing(Distiller(expert, replay, config, args.num_agents,
@@ -1914,10 +1772,9 @@ def distil(distiller, args, planning, header, out):
                 "data": [checksum(distiller.expert.params.values()),
                          checksum([replay.observation, replay.action, replay.ends]),
                          replay.header.get("task")]}
-    print(f"{args.task}: {student.config.num_agents} agents of {student.config.latent_dim} latent "
-          f"features, {len(distiller.optimizer.vector):,} weights; replay of "
-          f"{replay.transitions:,} transitions; {config.steps:,} steps of {config.batch_size} x "
-          f"{config.noise_samples}; results in {out}", file=sys.stderr)
+    print(f"{args.task}: {student.config.num_agents} agents, {len(distiller.optimizer.vector):,} "
+          f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
+          f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
     curve, seconds = train_student(distiller, out, settings, playing, args.workers)
     q, g = (x.tolist() for x in rank_correlation(distiller, 256, args.seed, planning.discount))
     save_model(out / "student.npz", student, {"kind": "student", **settings,
@@ -1982,8 +1839,7 @@ def report(result, planning, eval_seed):
     print(f"\nreturn kept {kept}, rank correlation of Q {q[0]:.3f} (h = 0) to {q[-1]:.3f} (h = "
           f"{len(q) - 1}), of the return {g[-1]:.3f}, distilled in {result['seconds']:.0f} s, "
           f"{result['seconds_total']:.0f} s in all, {result['out']}/")
-    if not result["picture"]:
-        print("(no picture: pip install 'fac-tdmpc-ref[plots]' draws curve.png)")
+    print("" if result["picture"] else "pip install 'fac-tdmpc-ref[plots]' draws curve.png, too")
 
 
 def return_kept(student, expert):
@@ -2001,13 +1857,9 @@ def print_table(rows):
 
 def command_evaluate(args):
     """evaluate: a model's returns on a task."""
-    from_args(PlannerConfig, args)  # wrong settings first, then wrong files
     model, header = load_model(args.model)
-    made_for = {"discount": trained_discount(header, args.model)}
-    if "distill" in header:
-        config = from_dict(DistillConfig, header["distill"], args.model)
-        made_for["horizon"] = config.horizon
-    planning, task = from_args(PlannerConfig, args, **made_for), args.task or header.get("task")
+    planning = from_args(PlannerConfig, args, **made_for(header, args.model))
+    task = args.task or header.get("task")
     need(task == header.get("task") or not args.record, f"{args.model}: header: task: expected "
          f"{task!r} to record its returns, found {header.get('task')!r}")
     found = evaluate(model, task, planning, args.episodes, args.seed, args.workers)
@@ -2083,6 +1935,7 @@ def make_parser():
                     "expert into one small world model for each joint, and plan with them in "
                     "parallel.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    positive = functools.partial(natural, least=1)
 
     sub = add_command(commands, "distill", command_distill, "Distil a task's expert into a "
                       "factored student (Algorithm 1), then evaluate and time both with MPPI.",
@@ -2099,7 +1952,8 @@ def make_parser():
     add("--eval-seed", type=natural, default=0, help="of the evaluation episodes [0]")
     add("--evaluate-expert", action="store_true",
         help="measure the expert's return anew instead of reading its record")
-    add_playing(sub)
+    add("--episodes", type=positive, default=20, help="evaluation episodes [20]")
+    add("--workers", type=natural, help="processes that play episodes; 0: this one [cores]")
     add_config(sub, DistillConfig)
     add_config(sub, PlannerConfig, prefix="plan-", skip=("horizon",))
 
@@ -2111,17 +1965,10 @@ def make_parser():
     add("--seed", type=natural, default=0, help="of the episodes [0]")
     add("--record", action="store_true",
         help="keep the returns in a .json file beside the model's, for distill")
-    add_playing(sub)
+    add("--episodes", type=positive, default=20, help="[20]")
+    add("--workers", type=natural, help="processes that play episodes; 0: this one [cores]")
     add_config(sub, PlannerConfig)
     return parser
-
-
-def add_playing(parser):
-    """The flags of what is played."""
-    parser.add_argument("--episodes", type=functools.partial(natural, least=1), default=20,
-                        help="evaluation episodes [20]")
-    parser.add_argument("--workers", type=natural, help="processes that play episodes side by "
-                        "side; 0: all in this one [cores]")
 
 
 def run_command(parser, argv=None):
@@ -2129,12 +1976,10 @@ def run_command(parser, argv=None):
     args = parser.parse_args(argv)
     try:
         result = args.run(args)
-    except (UserError, MemoryError) as error:
+    except (UserError, MemoryError, OSError) as error:
+        if isinstance(error, OSError):
+            error = f"{error.filename}: can't be read or written: {error.strerror}"
         print(f"{parser.prog}: error: {str(error) or 'not enough memory'}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"{parser.prog}: error: {error.filename}: can't be read or "
-              f"written: {error.strerror}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"{parser.prog}: interrupted; the same command goes on from its last checkpoint, "

@@ -139,7 +139,7 @@ def benchmark_decisions(robot, workers, planning, rounds):
         seconds = fac.interleaved_seconds(
             [gemm, *(functools.partial(subject[-1], obs) for subject in subjects)], rounds,
             f"{robot}: decisions")
-        hand_over = fac.interleaved_seconds([parallel.hand_over], 200, f"{robot}: hand-over")
+        hand_over = fac.interleaved_seconds([HandOver(stack, workers)], 200, f"{robot}: hand-over")
     multiply_add = float(np.median(seconds[:, 0])) / 512 ** 3
     rows = []
     for (model, preset, mode, measured, config, _), s in zip(subjects, seconds.T[1:]):
@@ -149,6 +149,22 @@ def benchmark_decisions(robot, workers, planning, rounds):
                      "samples": config.samples, "iterations": config.iterations,
                      "ms_median": ms, "floor_ms": floor, "ratio_to_floor": ms / floor})
     return rows, 1e6 * float(np.median(hand_over)) if workers else None
+
+
+class HandOver:
+    """Waking all workers and waiting for their answers, without planning: what a plan pays."""
+
+    def __init__(self, stack, workers):
+        self._workers = stack.enter_context(fac.Workers(_echo_worker, workers, "echo worker"))
+
+    def __call__(self):
+        self._workers.send_all(None)
+        self._workers.receive_all()
+
+
+def _echo_worker(connection):
+    while True:
+        connection.send(connection.recv())
 
 
 def one_agent(model, config):

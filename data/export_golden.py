@@ -16,7 +16,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import fac_tdmpc_ref as fac  # noqa: E402
-from train_expert import TrainingConfig  # noqa: E402
+from numpy_learner import ExpertConfig  # noqa: E402
 
 try:
     import torch
@@ -209,7 +209,7 @@ def write_golden(folder):
     """golden.npz of the expert and the replay in a folder."""
     path, rng = folder / "expert.npz", np.random.default_rng(0)
     expert, header = fac.load_model(path)
-    config = fac.from_dict(TrainingConfig, header["training"], f"{path}: header: training")
+    config = fac.from_dict(ExpertConfig, header["training"], f"{path}: header: training")
     planner = fac.PlannerConfig(samples=64, elites=8, pi_trajs=0)
     distill = fac.DistillConfig(batch_size=8, noise_samples=10, **AS_PRINTED)
     sizes = fac.student_config(expert.config, expert.config.dim_action, distill.sizes, "latent")
@@ -243,7 +243,7 @@ def narrow_golden(g, tag, agents, config):
 
 def write_narrow_golden(path):
     """golden-narrow.npz: small random networks, N = 1, 2, 3, 6, with everything in full."""
-    rng, config = np.random.default_rng(1), fac.ExpertConfig(latent_dim=5, enc_dim=16, mlp_dim=24)
+    rng, config = np.random.default_rng(1), ExpertConfig(latent_dim=5, enc_dim=16, mlp_dim=24)
     sizes, experts = fac.ModelConfig(7, 6, 1, 5, 16, 24), []
     for _ in range(2):
         experts.append(fac.WorldModel.create(sizes, rng, policy=True).params)

@@ -73,7 +73,7 @@ def policy(params, z, noise=0.0):
 def equation_1(params, target, obs, action, reward, config, noise=0.0):
     """Equation 1 on obs (H+1, B, O), action (H, B, A), reward (H, B): loss, its three terms.
 
-    As fac.equation_1: means over features and batch, weighted by lambda^h; what it holds fixed
+    As numpy_learner's: means over features and batch, weighted by lambda^h; what it holds fixed
     comes from the parameters `target` and the policy with noise (1, H * B, A). Returns also the
     latents s_0, ..., s_H (1, (H+1) * B, m).
     """
@@ -97,7 +97,7 @@ def equation_1(params, target, obs, action, reward, config, noise=0.0):
 
 
 class TorchLearner:
-    """fac.Learner in PyTorch: from the same weights and generator the same, up to rounding.
+    """numpy_learner.Learner in PyTorch: from the same weights and noise the same, up to rounding.
 
     model: the fac.WorldModel to start from, kept for `model`. precision: float32, or bfloat16 for
     the products of the hidden layers; weights, outputs and losses stay float32.

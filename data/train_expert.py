@@ -5,8 +5,8 @@
     python data/train_expert.py --task reacher-easy --student fac
     python data/train_expert.py --task walker-run --backend torch --mlp-dim 512 --batch-size 512
 
-One loop for two learners: fac.Learner needs nothing but NumPy, PyTorch's (--backend torch) can use
-a GPU or bfloat16. While the learner learns, actors play episodes beside it in processes of their
+One loop for two learners: numpy_learner.py's, and PyTorch's (--backend torch), which can use a
+GPU or bfloat16. While the learner learns, actors play episodes beside it in processes of their
 own, planning with fac.Planner on weights that are newer in every part of an episode.
 
 The folder --out then holds expert.npz and replay.npz, which `fac_tdmpc_ref.py distill --expert`
@@ -24,20 +24,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import fac_tdmpc_ref as fac  # noqa: E402
-
-
-@dataclasses.dataclass(frozen=True)
-class TrainingConfig(fac.ExpertConfig):
-    """Training the expert (Equation 1)."""
-    updates_per_step: float = fac.field(1.0, "updates for each decision", least=0)
-    std_start: float = fac.field(0.5, "smallest sampling deviation at the start (TD-MPC)", least=0)
-    std_steps: int = fac.field(25_000, "decisions over which it falls to the planner's min_std",
-                               least=0)
-    seed_decisions: int = fac.field(4_000, "random decisions before the first update", least=0)
-    buffer_size: int = fac.field(1_000_000, "replay capacity, transitions (Table 2)", least=1)
-    buffer_dtype: str = fac.field("float32", "how the replay is kept in memory",
-                                  choices=("float32", "float16"))
-
+from numpy_learner import ExpertConfig, Learner, named, restore  # noqa: E402
 
 # for a few cores; hidden layers of 512, as in Table 2, make an update three times as dear
 TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
@@ -196,36 +183,6 @@ class ReplayBuffer:
             compress=True)
 
 
-class NumPyLearner(fac.Learner):
-    """fac.Learner, with what the loop needs beside its `update`."""
-    about = {"backend": "numpy"}
-
-    def update(self, obs, actions, reward, rng):
-        """As fac.Learner's; returns the three terms of Equation 1 alone."""
-        return super().update(obs, actions, reward, rng)[0]
-
-    def state(self):
-        """Everything that a resumed run needs, as arrays."""
-        return {"slow": self.slow_vector, **named("expert", self.optimizer),
-                **named("policy", self.policy_optimizer)}
-
-    def load(self, arrays):
-        """Go on from a `state`."""
-        self.slow_vector[:] = arrays["slow"]
-        restore("expert", self.optimizer, arrays)
-        restore("policy", self.policy_optimizer, arrays)
-
-
-def named(name, optimizer):
-    """The state of a fac.Adam under its name."""
-    return {f"{name} {key}": value for key, value in optimizer.state().items()}
-
-
-def restore(name, optimizer, arrays):
-    """Give a fac.Adam the state that `named` has put into arrays."""
-    optimizer.load({key: arrays[f"{name} {key}"] for key in optimizer.state()})
-
-
 def make_learner(args, sizes, config):
     """NumPy's learner or PyTorch's, both from the same fresh weights.
 
@@ -234,7 +191,7 @@ def make_learner(args, sizes, config):
     """
     rng = fac.stream(args.seed, "expert")
     if args.backend == "numpy":
-        return NumPyLearner(sizes, config, rng)
+        return Learner(sizes, config, rng)
     try:
         import torch
     except ImportError:
@@ -487,7 +444,7 @@ def lag(curve, fraction):
 
 def read_settings(args):
     """(training, planning, distillation or None) of a command line; UserError if they don't fit."""
-    config = fac.from_args(TrainingConfig, args, **TRAINING_DEFAULTS)
+    config = fac.from_args(ExpertConfig, args, **TRAINING_DEFAULTS)
     planning = fac.from_args(fac.PlannerConfig, args, horizon=config.horizon,
                              discount=config.discount)
     distilling = fac.from_args(fac.DistillConfig, args, **FOLLOWING_DEFAULTS)
@@ -637,7 +594,7 @@ def make_parser():
         "on the way [4000]")
     add("--evaluate-episodes", type=natural, default=10, help="episodes in one [10]")
     add("--json", action="store_true", help="print one JSON object as the last line of stdout")
-    fac.add_config(parser, TrainingConfig, **TRAINING_DEFAULTS)
+    fac.add_config(parser, ExpertConfig, **TRAINING_DEFAULTS)
     fac.add_config(parser, fac.PlannerConfig, "MPPI while training", "plan-",
                    skip=("discount",))
     fac.add_config(parser, fac.DistillConfig, "The student (Algorithm 1), on the expert's batches "

@@ -21,6 +21,7 @@ import torch  # noqa: E402
 import torch.nn.functional as F  # noqa: E402
 
 import fac_tdmpc_ref as fac  # noqa: E402
+import numpy_learner  # noqa: E402
 
 
 def run_network(kinds, params, name, x):
@@ -209,8 +210,8 @@ def training(threads, turns, batch=256):
     """(ratio, our ms, PyTorch's ms) of an update of Equation 1, policy and averages included."""
     sys.path.insert(0, str(fac.DATA))
     from torch_learner import TorchLearner
-    config, rng = fac.ExpertConfig(batch_size=batch), np.random.default_rng(0)
-    ours = fac.Learner(fac.ModelConfig(24, 6), config, rng)
+    config, rng = numpy_learner.ExpertConfig(batch_size=batch), np.random.default_rng(0)
+    ours = numpy_learner.Learner(fac.ModelConfig(24, 6), config, rng)
     theirs = TorchLearner(fac.WorldModel.create(ours.model.config, rng, policy=True), config, "cpu")
     obs = rng.standard_normal((4, 24, batch), np.float32)
     reward = rng.random((3, batch), np.float32)

@@ -17,6 +17,7 @@ sys.path.insert(0, str(ROOT))
 
 import fac_tdmpc_ref as fac  # noqa: E402
 from export_golden import digest  # noqa: E402
+from numpy_learner import ExpertConfig  # noqa: E402
 
 F32 = np.float32
 
@@ -312,7 +313,7 @@ def test_sizes_in_the_header_must_be_those_of_the_weights(expert_file):
 @pytest.mark.parametrize("config", [
     fac.PlannerConfig(samples=40, min_std=0.1, output="mean"),
     fac.DistillConfig(steps=3, kl="reverse"),
-    fac.ModelConfig(8, 3, 3, expert_latent_dim=6), fac.ExpertConfig(lr=1e-3)])
+    fac.ModelConfig(8, 3, 3, expert_latent_dim=6), ExpertConfig(lr=1e-3)])
 def test_a_config_survives_json(config):
     values = json.loads(json.dumps(vars(config)))
     assert fac.from_dict(type(config), values, "x") == config

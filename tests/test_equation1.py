@@ -5,17 +5,18 @@ import numpy as np
 import pytest
 
 import fac_tdmpc_ref as fac
+from numpy_learner import ExpertConfig, Learner, equation_1, policy_loss, td_targets
 from test_golden import (FORWARD, GRADIENT, NARROW, TASKS, assert_digest, narrow_expert, present,
                          relative)
 from test_layers import assert_close, numeric_gradient
 
-CONFIG = fac.ExpertConfig(latent_dim=3, enc_dim=5, mlp_dim=6, lam=0.7, batch_size=4,
-                          consistency_coef=1.5, value_coef=0.3)
+CONFIG = ExpertConfig(latent_dim=3, enc_dim=5, mlp_dim=6, lam=0.7, batch_size=4,
+                      consistency_coef=1.5, value_coef=0.3)
 
 
 def small_learner(rng, dtype=np.float64):
     """A learner whose every weight is alive, its moving averages apart from its model."""
-    learner = fac.Learner(fac.ModelConfig(4, 2, 1, 3, 5, 6), CONFIG, rng, dtype)
+    learner = Learner(fac.ModelConfig(4, 2, 1, 3, 5, 6), CONFIG, rng, dtype)
     for vector in (learner.optimizer.vector, learner.policy_optimizer.vector, learner.slow_vector):
         vector += 0.3 * rng.standard_normal(vector.shape).astype(dtype)
     return learner
@@ -33,12 +34,12 @@ def test_gradients_through_the_rollout(steps, batch):
     rng = np.random.default_rng(0)
     learner = small_learner(rng)
     obs, actions, reward = small_batch(rng, steps, batch)
-    latents, td = fac.td_targets(learner.model, learner.target, obs[1:], reward,
+    latents, td = td_targets(learner.model, learner.target, obs[1:], reward,
                                  np.zeros((2, steps * batch)), 0.9)
     case = obs[0], actions, reward, latents, td, CONFIG
-    fac.equation_1(learner.model, *case, learner.optimizer.grads)
+    equation_1(learner.model, *case, learner.optimizer.grads)
     for key, value in learner.optimizer.params.items():
-        expected = numeric_gradient(lambda: fac.equation_1(learner.model, *case)[0], value)
+        expected = numeric_gradient(lambda: equation_1(learner.model, *case)[0], value)
         assert_close(learner.optimizer.grads[key], expected, 1e-5)
         assert np.abs(expected).max() > 1e-7, f"{key}: the check compares zeros"
 
@@ -49,9 +50,9 @@ def test_policy_gradient():
     rollout, noise = rng.standard_normal((1, 3, 12)), 0.01 * rng.standard_normal((2, 3, 4))
     grads, model = learner.policy_optimizer.grads, learner.model
     before = {k: v.copy() for k, v in learner.optimizer.grads.items()}
-    loss = fac.policy_loss(model, rollout, noise, 0.7, grads)
+    loss = policy_loss(model, rollout, noise, 0.7, grads)
     for key, value in learner.policy_optimizer.params.items():
-        expected = numeric_gradient(lambda: fac.policy_loss(
+        expected = numeric_gradient(lambda: policy_loss(
             model, rollout, noise, 0.7, {k: np.zeros_like(v) for k, v in grads.items()}), value)
         assert_close(grads[key], expected, 1e-5)
         assert np.abs(expected).max() > 1e-7
@@ -68,7 +69,7 @@ def test_clipped_policy_noise_lets_gradients_through():
     learner = small_learner(rng)
     learner.model.params["_pi.4.bias"][:] = 3  # tanh(3) = 0.995
     noise = np.full((2, 1, 5), 0.3)
-    fac.policy_loss(learner.model, rng.standard_normal((1, 3, 5)), noise, 1.0,
+    policy_loss(learner.model, rng.standard_normal((1, 3, 5)), noise, 1.0,
                     learner.policy_optimizer.grads)
     assert np.abs(learner.policy_optimizer.grads["_pi.4.bias"]).min() > 0
 
@@ -81,7 +82,7 @@ def golden_case(source):
     else:
         header, g = fac.read_npz(fac.DATA / source / "golden.npz", ("golden",))
         models = [fac.load_model(fac.DATA / source / "expert.npz")[0]] * 2
-    return *models, g, fac.ExpertConfig(**present(fac.ExpertConfig, header["training"]))
+    return *models, g, ExpertConfig(**present(ExpertConfig, header["training"]))
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -96,10 +97,10 @@ def test_golden_loss_and_gradients(source, dtype):
                      for m in (model, target))
     g = {k: v.astype(dtype) if k in ("obs", "action", "rewards") else v for k, v in g.items()}
     steps, dim_action, batch = g["action"].shape
-    latents, td = fac.td_targets(model, target, g["obs"][1:], g["rewards"],
+    latents, td = td_targets(model, target, g["obs"][1:], g["rewards"],
                                  np.zeros((dim_action, steps * batch), dtype), config.discount)
     grads = {k: np.zeros_like(v) for k, v in model.params.items() if not k.startswith("_pi")}
-    loss, terms, rollout = fac.equation_1(model, g["obs"][0], g["action"], g["rewards"], latents,
+    loss, terms, rollout = equation_1(model, g["obs"][0], g["action"], g["rewards"], latents,
                                           td, config, grads)
     assert rollout.dtype == td.dtype == latents.dtype == dtype
     assert abs(loss / g["equation1_loss"] - 1) < bound
@@ -132,7 +133,7 @@ def test_ten_updates_are_pytorch_s(dtype, tolerance):
         theirs.target[key].copy_(torch.tensor(value))
     for t in range(10):
         batch = small_batch(np.random.default_rng(t), dtype=dtype)
-        found, _ = ours.update(*batch, np.random.default_rng(t))
+        found = ours.update(*batch, np.random.default_rng(t))
         expected = theirs.update(*batch, np.random.default_rng(t))
         assert_close(np.array(found), np.array(expected), 10 * tolerance)
     for model, params in ((ours.model, theirs.model.params), (ours.target, theirs.target)):
@@ -189,7 +190,7 @@ def test_an_update_s_targets_and_policy_see_that_noise(monkeypatch):
         monkeypatch.setattr(fac, "POLICY_STD", std)
         rng = np.random.default_rng(5)
         learner = small_learner(rng, np.float32)
-        found, _ = learner.update(*small_batch(rng, dtype=np.float32), rng)
+        found = learner.update(*small_batch(rng, dtype=np.float32), rng)
         terms.append((*found, learner.policy_optimizer.m.sum()))
     assert terms[0] == terms[1] and terms[0][:2] == terms[2][:2]
     assert terms[0][2] != terms[2][2] and terms[0][3] != terms[2][3]

@@ -9,6 +9,7 @@ import pytest
 
 import fac_tdmpc_ref as fac
 from export_golden import digest
+from numpy_learner import ExpertConfig
 from test_layers import UNSEEN
 
 TASKS = sorted(p.parent.name for p in fac.DATA.glob("*/golden.npz"))
@@ -222,7 +223,7 @@ def assert_same(found, stored, tolerance):
 
 def test_pytorch_computes_what_a_golden_file_holds(golden, export_golden):
     expert, header, g = golden
-    found = export_golden.task_golden(expert, g, settings_of(fac.ExpertConfig, header, "training"),
+    found = export_golden.task_golden(expert, g, settings_of(ExpertConfig, header, "training"),
                                       settings_of(fac.PlannerConfig, header, "planner"),
                                       settings_of(fac.DistillConfig, header, "distill"))
     assert {"kl_loss", "mppi_elites", "equation1_loss", "adam_losses"} <= set(found) <= set(g)
@@ -232,7 +233,7 @@ def test_pytorch_computes_what_a_golden_file_holds(golden, export_golden):
 def test_pytorch_computes_what_the_narrow_file_holds(export_golden):
     header, g = fac.read_npz(NARROW, ("golden",))
     experts = [narrow_expert(header, g, prefix).params for prefix in ("model ", "target ")]
-    found = export_golden.expert_golden(*experts, g, settings_of(fac.ExpertConfig, header,
+    found = export_golden.expert_golden(*experts, g, settings_of(ExpertConfig, header,
                                                                  "training"))
     assert_same(found, g, 1e-6)  # kept as float32
     for tag, config in header["configs"].items():

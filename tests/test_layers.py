@@ -169,10 +169,11 @@ def test_agents_must_divide_the_actions():
         fac.ModelConfig(8, 6, 4)
 
 
-def test_clip_norm():
-    vector = np.array([3.0, 4.0])
-    assert fac.clip_norm(vector, 10) == 5 and vector.tolist() == [3, 4]
-    assert fac.clip_norm(vector, 1) == 5 and np.isclose(np.linalg.norm(vector), 1, atol=1e-6)
+def test_a_step_gives_the_gradient_s_norm_before_clipping():
+    adam = fac.Adam({"w": np.zeros(2)})
+    for clip in (10, 1):
+        adam.grads["w"] += [3.0, 4.0]
+        assert adam.step(0.1, clip) == 5
 
 
 def test_flatten_gives_views():

@@ -299,15 +299,6 @@ def test_a_worker_that_ends_while_it_is_sent_to_says_why():
             workers.send(0, bytes(10_000_000))  # more than a pipe holds
 
 
-def test_handing_over_leaves_the_plan_alone():
-    config, obs = fac.PlannerConfig(samples=16, iterations=1), np.ones(8, np.float32)
-    with fac.Planner(random_model(), config, seed=1, workers=1) as planner:
-        planner.hand_over()
-        found = planner.act(obs)
-        planner.reset(1)
-        assert np.array_equal(found, planner.act(obs))
-
-
 def test_a_gain_of_zero_is_a_gain_all_the_same():
     model, rng = random_model(), np.random.default_rng(3)
     model.params["_Q1.1.weight"][:, :4] = 0
