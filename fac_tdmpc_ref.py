@@ -169,7 +169,7 @@ class PlannerConfig(Settings):
 @dataclass(frozen=True)
 class DistillConfig(Settings):
     """Algorithm 1. `--preset paper` takes each field's paper value."""
-    steps: int = field(12_000, "gradient steps [D1]", paper=100_000, least=1)
+    steps: int = field(14_000, "gradient steps [D1]", paper=100_000, least=1)
     batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=1)
     noise_samples: int = field(5, "K: perturbations of each action [D1]", paper=10, least=2)
     noise_std: float = field(2.0, "largest deviation of the perturbations [D8]", paper=0.5, above=0)
@@ -1257,12 +1257,12 @@ class Environment:
                 f"dm-control==1.0.50, and MUJOCO_GL unset or one of egl, osmesa, disable "
                 f"(it is {os.environ['MUJOCO_GL']!r})") from error
         if domain == "reacher":
-            self._env = control.Environment(
+            self.env = control.Environment(
                 reacher.Physics.from_xml_string(REACHER_XML),
                 reacher.Reacher(REACHER_TARGET[name], random=0), time_limit=20)
         else:
-            self._env = suite.load(domain, name, task_kwargs={"random": 0})
-        spec = self._env.action_spec()
+            self.env = suite.load(domain, name, task_kwargs={"random": 0})
+        spec = self.env.action_spec()
         self._low, self._scale = spec.minimum, (spec.maximum - spec.minimum) / 2
 
     @staticmethod
@@ -1271,15 +1271,15 @@ class Environment:
 
     def reset(self, seed):
         """Start the episode that the integer `seed` stands for; returns (dim O,)."""
-        self._env.task.random.seed(seed)
-        return self._observation(self._env.reset())
+        self.env.task.random.seed(seed)
+        return self._observation(self.env.reset())
 
     def step(self, action):
         """Apply action (dim A,); returns next observation (dim O,) and reward in [0, 2]."""
         control = self._low + self._scale * (np.asarray(action, np.float64) + 1)
         reward = 0.0
         for _ in range(ACTION_REPEAT):
-            timestep = self._env.step(control)
+            timestep = self.env.step(control)
             reward += timestep.reward
         return self._observation(timestep), reward
 
@@ -1411,8 +1411,9 @@ def made_for(header, where):
         settings = header.get(group) or {}
         need(isinstance(settings, dict), f"{where}: header: {group}: expected settings, found "
              f"{settings!r}")
-        found.update({name: settings[name]} if name in settings else {})
-    from_dict(PlannerConfig, found, f"{where}: header")
+        if name in settings:
+            from_dict(PlannerConfig, {name: settings[name]}, f"{where}: header: {group}")
+            found[name] = settings[name]
     return found
 
 

@@ -4,14 +4,17 @@
     python data/experiments.py table3 --figure data/figures/prediction.png
 
 `table3` times the networks and whole decisions, centralized and factored, by threads and
-processes; `--figure` draws Figure 6 from it. A client of fac_tdmpc_ref.py, which knows nothing of
-what is here.
+processes; `--figure` draws Figure 6 from it. `watch` plays an episode as a moving picture, of one
+model or two side by side. A client of fac_tdmpc_ref.py, which knows nothing of what is here.
 """
 import contextlib
 import dataclasses
 import functools
+import os
 import pickle
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -270,6 +273,105 @@ def draw_prediction(path, prediction, robots):
     fac.save_figure(path, figure)
 
 
+# ------------------------------------------------------------------- section 5.6: watching
+
+PIXELS, BARS, TEXT = 240, 70, 34  # a picture's side, width of the bars beside, height of the text
+RENDERERS = "from dm_control import suite; suite.load('reacher', 'easy').physics.render(8, 8)"
+
+
+def choose_renderer():
+    """Set MUJOCO_GL to what draws off-screen here; UserError if nothing does."""
+    for backend in filter(None, (os.environ.get("MUJOCO_GL"), "egl", "osmesa")):
+        environment = {**os.environ, "MUJOCO_GL": backend}
+        if not subprocess.run([sys.executable, "-c", RENDERERS], env=environment,
+                              capture_output=True).returncode:
+            os.environ["MUJOCO_GL"] = backend
+            return
+    raise fac.UserError("MuJoCo can't draw off-screen here: install EGL (Debian: libegl1) or "
+                        "OSMesa (libosmesa6)")
+
+
+def shares(model, z, config):
+    """What each agent's own plan from z (N, m, 1) is worth to it above doing nothing, (N,)."""
+    n = model.config.num_agents
+    returns = functools.partial(fac.h_step_return, model, z, config=config)
+    nothing = np.zeros((n, config.horizon + 1, model.config.agent_actions), fac.F32)
+    plan, _, _ = fac.mppi(returns, nothing, config, [np.random.default_rng(0) for _ in range(n)])
+    worth = returns(np.stack([plan, nothing], -1))
+    return worth[:, 0] - worth[:, 1]
+
+
+def watch_episode(path, task, seed, decisions, every):
+    """Frames of a model's episode: picture, shares (N,) and return so far of each; and its name
+    with the median milliseconds of a decision."""
+    model, header = fac.load_model(path)
+    fac.check_task(model.config, task)
+    config = fac.PlannerConfig(**fac.made_for(header, path))
+    environment, frames, total, seconds = fac.Environment(task), [], 0.0, []
+    with fac.Planner(model, config) as planner, fac.progress(f"playing {path}", decisions,
+                                                             "decision") as bar:
+        planner.reset(seed)
+        obs = environment.reset(seed)
+        for t in range(decisions):
+            if t % every == 0:
+                picture = environment.env.physics.render(PIXELS, PIXELS, camera_id=0)
+                frames.append((picture, shares(model, model.encode(obs[:, None]), config), total))
+            begin = time.perf_counter()
+            action = planner.act(obs)
+            seconds.append(time.perf_counter() - begin)
+            obs, reward = environment.step(action)
+            total += reward
+            bar.update()
+    name = f"{header['kind']}, N = {model.config.num_agents}"
+    return frames, name, 1e3 * float(np.median(seconds))
+
+
+def draw_frames(episodes):
+    """PIL images of episodes side by side, each with bars for its agents' shares."""
+    from PIL import Image, ImageDraw
+    width, images = PIXELS + BARS, []
+    largest = [max(np.abs(share).max() for _, share, _ in frames) + 1e-9
+               for frames, *_ in episodes]
+    for columns in zip(*(frames for frames, *_ in episodes)):
+        image = Image.new("RGB", (width * len(episodes), PIXELS + TEXT), "white")
+        draw = ImageDraw.Draw(image)
+        for k, (picture, share, total) in enumerate(columns):
+            left, (_, name, ms) = k * width, episodes[k]
+            image.paste(Image.fromarray(picture), (left, 0))
+            height, middle = PIXELS / len(share), left + PIXELS + BARS / 2
+            for i, value in enumerate(share / largest[k] * (BARS / 2 - 4)):
+                draw.rectangle((min(middle, middle + value), (i + 0.15) * height,
+                                max(middle, middle + value), (i + 0.85) * height),
+                               fill="#1f77b4" if value > 0 else "#999999", outline="black")
+            draw.line((middle, 0, middle, PIXELS), fill="black")
+            draw.text((left + 4, PIXELS + 4), f"{name}: {ms:.1f} ms a decision", fill="black")
+            draw.text((left + 4, PIXELS + 18), f"return so far {total:.0f}", fill="black")
+        images.append(image)
+    return images
+
+
+def command_watch(args):
+    """watch: an episode as a moving picture."""
+    if Path(args.out).suffix != ".gif":
+        raise fac.UserError(f"{args.out}: expected a name that ends in .gif")
+    fac.pyplot()  # brings Pillow
+    paths = [args.model] + ([args.beside] if args.beside else [])
+    task = args.task or fac.load_model(args.model)[1].get("task")
+    fac.lookup_task(task)
+    choose_renderer()
+    seed = fac.episode_seeds(args.seed, args.episode + 1)[args.episode]
+    episodes = [watch_episode(path, task, seed, args.decisions, args.every) for path in paths]
+    images = [image.quantize(64) for image in draw_frames(episodes)]
+    seconds = fac.ACTION_REPEAT * fac.Environment(task).env.control_timestep() * args.every
+    with fac.atomic_file(args.out) as file:
+        images[0].save(file, format="gif", save_all=True, append_images=images[1:], loop=0,
+                       duration=max(20, int(1e3 * seconds)))
+    result = {"out": args.out, "frames": len(images), "bytes": Path(args.out).stat().st_size,
+              "ms": [ms for *_, ms in episodes], "returns": [f[-1][2] for f, *_ in episodes]}
+    print(f"{args.out}: {result['frames']} frames, {result['bytes'] / 1e6:.1f} MB")
+    return result
+
+
 # ------------------------------------------------------------------------------ command line
 
 
@@ -291,6 +393,19 @@ def make_parser():
                      "tenth as often [100]")
     sub.add_argument("--figure", help="draw Figure 6 into this file")
     fac.add_config(sub, fac.PlannerConfig, **fac.paper_preset(fac.PlannerConfig))
+    sub = fac.add_command(
+        commands, "watch", command_watch, "An episode as a moving picture: beside the robot a bar "
+        "for each agent, what its plan is worth above doing nothing; below, a decision's time.")
+    sub.add_argument("--model", required=True, help="an expert.npz or student.npz")
+    sub.add_argument("--beside", help="another one, on the same episode")
+    sub.add_argument("--task", help="one of: " + ", ".join(fac.TASKS) + " [the model's own]")
+    sub.add_argument("--seed", type=fac.natural, default=0, help="of the evaluation [0]")
+    sub.add_argument("--episode", type=fac.natural, default=0, help="of that evaluation [0]")
+    sub.add_argument("--decisions", type=functools.partial(fac.natural, least=1), default=150,
+                     help="[150]")
+    sub.add_argument("--every", type=functools.partial(fac.natural, least=1), default=2,
+                     help="decisions between two frames [2]")
+    sub.add_argument("--out", required=True, help="a .gif file")
     return parser
 
 

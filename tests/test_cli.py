@@ -175,12 +175,14 @@ def configs_of(monkeypatch, *arguments):
         caught.append(from_args(*args, **defaults))
         return caught[-1]
 
-    def stop(*_):
+    def stop(*_, **__):
         raise fac.UserError("enough")
 
     monkeypatch.setattr(fac, "from_args", watched)
-    for function in ("lookup_task", "load_model"):
-        monkeypatch.setattr(fac, function, stop)
+    monkeypatch.setattr(fac, "load_data", lambda _: (None, {}, None, "x"))
+    monkeypatch.setattr(fac, "load_model", lambda _: (None, {}))
+    for where, function in ((fac.Path, "mkdir"), (fac, "evaluate")):
+        monkeypatch.setattr(where, function, stop)
     assert fac.main([str(a) for a in arguments]) == 2
     monkeypatch.undo()
     return tuple(caught)
@@ -351,7 +353,7 @@ def test_a_task_without_data_says_what_to_do(tmp_path):
         pytest.skip("there is data for every task")
     task = without[-1]
     refused(run("distill", "--task", task, cwd=tmp_path), f"train_expert.py --task {task}",
-            "--expert", "at hand for")
+            "--expert", "holds")
     assert os.listdir(tmp_path) == []
 
 
@@ -520,7 +522,7 @@ def test_a_killed_run_whose_student_plays_goes_on(tmp_path, files, no_plots):
     for stop in (3, 5):  # the student plays before steps 2, 3 and 5, counted from 0
         assert distill("parts", "--workers", "2", stop=stop).returncode == -signal.SIGKILL
     with np.load(tmp_path / "parts" / "checkpoint.npz") as file:
-        assert file["own_action"].shape == (4, fac.EPISODE_STEPS, 3)
+        assert file["own"].shape == (4 * fac.EPISODE_STEPS, 8)
     succeeded(distill("parts"))
     assert student_of(tmp_path / "parts") == student_of(tmp_path / "whole")
     without = distill_arguments(files, "--out", tmp_path / "without")
@@ -592,8 +594,8 @@ def test_models_plan_with_the_discount_they_were_trained_with(tmp_path, files, c
             for command in (arguments, evaluations[0]):
                 assert fac.main([str(a) for a in command]) == 2
                 message = capsys.readouterr().err.splitlines()[-1]
-                assert "expert.npz: header: training: discount" in message
-                assert f"found {discount!r}" in message
+                assert "expert.npz: header: training: " in message
+                assert "discount" in message and message.endswith(repr(discount))
             return
         for command in (arguments, *evaluations, [*evaluations[0], "--discount", "0.5"]):
             assert fac.main([str(a) for a in command]) == 0

@@ -440,13 +440,13 @@ def test_sequences(tmp_path):
 def test_data_file(tmp_path, monkeypatch):
     monkeypatch.setattr(fac, "DATA", tmp_path)
     message = refusal(lambda: fac.data_file("fish-swim", "expert.npz"),
-                      tmp_path / "fish-swim" / "expert.npz", "at hand for: none",
+                      tmp_path / "fish-swim" / "expert.npz", "holds none",
                       "train_expert.py --task fish-swim", "--expert", "--replay")
     assert "walker" not in message
     for task in ("walker-walk", "cheetah-run"):
         (tmp_path / task).mkdir()
         (tmp_path / task / "expert.npz").touch()
-    refusal(lambda: fac.data_file("fish-swim", "expert.npz"), "cheetah-run, walker-walk (")
+    refusal(lambda: fac.data_file("fish-swim", "expert.npz"), "cheetah-run, walker-walk. Train")
     found = fac.data_file("walker-walk", "expert.npz")
     assert found == tmp_path / "walker-walk" / "expert.npz"
     refusal(lambda: fac.data_file("walker-walk", "replay.npz"), "walker-walk/replay.npz")

@@ -66,7 +66,7 @@ def test_sizes_in_mujoco_are_those_of_figure_3(task):
     obs, reward = env.step(np.zeros(dim_action))
     assert obs.shape == (dim_obs,) and obs.dtype == np.float32
     assert 0 <= reward <= 2
-    assert env._env.action_spec().shape == (dim_action,)  # MuJoCo's own count of the actuators
+    assert env.env.action_spec().shape == (dim_action,)  # MuJoCo's own count of the actuators
 
 
 @pytest.mark.parametrize("task", FIGURE_3)
@@ -108,14 +108,14 @@ def test_a_decision_is_two_control_steps_whose_rewards_are_added(task):
 @pytest.mark.parametrize("task", ROBOTS)
 def test_500_decisions_end_where_the_episode_of_dm_control_ends(task, monkeypatch):
     env, last = environment(task), []
-    step = env._env.step
+    step = env.env.step
 
     def recorded(control):
         timestep = step(control)
         last.append(timestep.last())
         return timestep
 
-    monkeypatch.setattr(env._env, "step", recorded)
+    monkeypatch.setattr(env.env, "step", recorded)
     env.reset(0)
     for _ in range(500):
         env.step(np.zeros(env.dim_action))
@@ -144,8 +144,8 @@ def test_actions_are_scaled_to_the_action_spec(monkeypatch):
 @pytest.mark.parametrize("task", ROBOTS)
 def test_extreme_actions_are_the_limits_of_the_robot(task, monkeypatch):
     env, received = environment(task), []
-    step, spec = env._env.step, env._env.action_spec()
-    monkeypatch.setattr(env._env, "step", lambda a: received.append(np.array(a)) or step(a))
+    step, spec = env.env.step, env.env.action_spec()
+    monkeypatch.setattr(env.env, "step", lambda a: received.append(np.array(a)) or step(a))
     env.reset(0)
     for sign, limit in ((-1, spec.minimum), (1, spec.maximum)):
         env.step(np.full(env.dim_action, sign))
@@ -202,36 +202,36 @@ def finger_position(joints):
 
 
 def put_target(env, position):
-    env._env.physics.named.model.geom_pos["target", ["x", "y"]] = position
+    env.env.physics.named.model.geom_pos["target", ["x", "y"]] = position
 
 
 @pytest.mark.parametrize("task", ["reacher-easy", "reacher-hard"])
 def test_reacher_is_a_chain_of_three_links_of_9_cm(task):
     env = environment(task)
     obs = env.reset(4)
-    target = env._env.physics.named.data.geom_xpos["target", :2].copy()
+    target = env.env.physics.named.data.geom_xpos["target", :2].copy()
     assert 0.05 <= np.linalg.norm(target) <= 0.20
     for action in actions_for(task, 60):
         finger = finger_position(obs[:3])
-        np.testing.assert_allclose(env._env.physics.named.data.geom_xpos["finger", :2], finger,
+        np.testing.assert_allclose(env.env.physics.named.data.geom_xpos["finger", :2], finger,
                                    atol=1e-6)
         np.testing.assert_allclose(obs[3:5], target - finger, atol=1e-6)
         before = obs
         obs, _ = env.step(action)
     assert np.abs(obs[:3] - before[:3]).max() > 1e-3  # it moved, so the chain was tested
-    data = env._env.physics.data
+    data = env.env.physics.data
     np.testing.assert_array_equal(obs[5:], data.qvel.astype(np.float32))
 
 
 def test_reacher_inner_joints_stop_at_80_degrees():
     env = environment("reacher-hard")
     env.reset(0)
-    model = env._env.physics.model
+    model = env.env.physics.model
     assert model.jnt_limited.tolist() == [0, 1, 1]
     np.testing.assert_allclose(model.jnt_range[1:], np.radians([[-80, 80]] * 2))
-    with env._env.physics.reset_context():
-        env._env.physics.data.qpos[:] = np.radians([25, 80, 80])
-    folded = np.linalg.norm(env._env.physics.named.data.geom_xpos["finger", :2])
+    with env.env.physics.reset_context():
+        env.env.physics.data.qpos[:] = np.radians([25, 80, 80])
+    folded = np.linalg.norm(env.env.physics.named.data.geom_xpos["finger", :2])
     assert abs(folded - 0.121) < 5e-4
     env.reset(0)
     for _ in range(150):
@@ -246,7 +246,7 @@ def test_reacher_rewards_each_control_step_inside_target_and_finger(task, target
     env = environment(task)
     for seed, direction in ((0, 0.3), (1, 2.0), (2, -2.2)):
         obs = env.reset(seed)
-        sizes = env._env.physics.named.model.geom_size
+        sizes = env.env.physics.named.model.geom_size
         assert sizes["target", 0] == target_radius and sizes["finger", 0] == 0.01
         unit = np.array([np.cos(direction), np.sin(direction)])
         for distance, expected in ((target_radius + 0.01 - 1e-4, 2.0), (0.0, 2.0),
@@ -337,5 +337,5 @@ def test_new_targets_lie_where_the_task_draws_them():
     env, seen = environment("reacher-hard"), []
     for seed in range(200):
         env.reset(seed)
-        seen.append(np.linalg.norm(env._env.physics.named.data.geom_xpos["target", :2]))
+        seen.append(np.linalg.norm(env.env.physics.named.data.geom_xpos["target", :2]))
     assert 0.05 <= min(seen) < 0.06 and 0.19 < max(seen) <= 0.2

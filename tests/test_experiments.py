@@ -28,7 +28,7 @@ def refused(done, *parts):
     (["table3", "--robots", "reecher"], ["'reecher'", *experiments.ROBOTS]),
     (["table3", "--runs", "9"], ["runs", "at least 10"]),
     (["table3", "--workers", "-1"], ["--workers", "-1"]),
-    (["table3", "--elites", "600"], ["600 elites", "512 samples"])])
+    (["table3", "--elites", "600"], ["samples (512)", "not 600"])])
 def test_bad_commands_are_refused(tmp_path, flags, parts):
     refused(run(*flags, cwd=tmp_path), *parts)
 
@@ -92,3 +92,52 @@ def test_multiply_adds_count_the_weights_of_equation_2():
     config = fac.PlannerConfig(samples=7, iterations=2, horizon=3)
     assert experiments.multiply_adds(model.config, config) == 7 * 2 * (
         3 * (sizes["_dynamics"] + sizes["_reward"]) + sizes["_Q"])
+
+
+# watch --------------------------------------------------------------------------------
+
+
+def test_shares_are_each_agent_s_own():
+    """An agent alone plans and gains the same (Proposition 1), and more than nothing."""
+    model, config = random_model(), fac.PlannerConfig(samples=64, horizon=2)
+    z = model.encode(np.random.default_rng(0).standard_normal((8, 1), np.float32))
+    found = experiments.shares(model, z, config)
+    alone = [experiments.shares(model.agents(i, i + 1), z[i:i + 1], config)[0] for i in range(3)]
+    assert found.shape == (3,) and (found > 0).all()
+    np.testing.assert_allclose(found, alone, rtol=1e-4)
+
+
+def test_frames_hold_pictures_and_bars():
+    pytest.importorskip("PIL")
+    size, shares = experiments.PIXELS, np.array([1.0, -0.5])
+    frames = [(np.full((size, size, 3), 7, np.uint8), shares, 3.0)] * 4
+    images = experiments.draw_frames([(frames, "expert, N = 2", 1.0), (frames, "student", 2.0)])
+    width = size + experiments.BARS
+    assert len(images) == 4 and images[0].size == (2 * width, size + experiments.TEXT)
+    for left in (0, width):
+        assert images[0].getpixel((left + 5, 5)) == (7, 7, 7)
+        middle = left + size + experiments.BARS // 2
+        assert images[0].getpixel((middle + 8, size // 4)) == (31, 119, 180)  # a gain, blue
+        assert images[0].getpixel((middle - 8, 3 * size // 4)) == (153, 153, 153)
+        assert images[0].getpixel((middle - 8, size // 4)) == (255, 255, 255)
+
+
+def test_watch_writes_a_moving_picture(tmp_path):
+    image = pytest.importorskip("PIL.Image")
+    expert = fac.data_file("reacher-easy", "expert.npz")
+    done = run("watch", "--model", expert, "--beside", expert, "--decisions", "4", "--out", "x.gif",
+               "--json", cwd=tmp_path)
+    if "can't draw off-screen" in done.stderr:
+        pytest.skip("neither EGL nor OSMesa here")
+    result = last_json(done)
+    assert result["frames"] == 2 and result["returns"][0] == result["returns"][1]
+    with image.open(tmp_path / "x.gif") as found:
+        assert found.n_frames == 2 and result["bytes"] == (tmp_path / "x.gif").stat().st_size
+
+
+@pytest.mark.parametrize("flags, parts", [
+    (["--model", "none.npz", "--out", "x.gif"], ["none.npz", "no such file"]),
+    (["--model", "none.npz", "--out", "x.png"], ["x.png", ".gif"])])
+def test_watch_refuses(tmp_path, flags, parts):
+    pytest.importorskip("matplotlib")
+    refused(run("watch", *flags, cwd=tmp_path), *parts)
