@@ -1318,7 +1318,7 @@ def renew_targets(task, obs, share, rng):
         obs[3:5, chosen] = draw_targets(obs[:, chosen], rng)
 
 
-# ==== 7. Files: weights, replay, replay buffer ========================================
+# ==== 7. Files: weights, replay, records ==============================================
 
 DATA = Path(__file__).resolve().parent / "data"
 FORMAT = "fac-tdmpc-ref 1"

@@ -256,3 +256,21 @@ def test_no_two_uses_of_a_seed_share_numbers():
              for use in ("batch", "own episode", "student") for i in (0, 1, 3)}
     assert len(draws) == 27
     assert fac.stream(0, "batch").random() == fac.stream(0, "batch", 0).random()
+
+
+@pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.parametrize("odd", [
+    {"batch_size": 1}, {"noise_samples": 2}, {"horizon": 0}, {"steps": 1}, {"reuse": 7},
+    {"batch_size": 3, "reuse": 1}, {"warmup": 0}, {"lam": 0.0}, {"noise_std_min": 2.0}])
+def test_odd_settings_learn_all_the_same(replay, odd, n):
+    config = fac.dataclasses.replace(CONFIG, **{"batch_size": 4, "steps": 3, **odd})
+    distiller, losses = distilled(replay, config, config.steps, n)
+    assert losses.shape == (config.steps, 3) and np.isfinite(losses).all() and (losses >= 0).all()
+    assert np.isfinite(fac.rank_correlation(distiller, 8, 0)).all()
+
+
+def test_an_expert_without_a_policy_says_so(replay):
+    expert = random_model(n=1)
+    with pytest.raises(fac.UserError, match="no policy.*--own-episodes 0"):
+        fac.Distiller(expert, replay, fac.dataclasses.replace(CONFIG, own_episodes=2))
+    fac.Distiller(expert, replay, CONFIG).close()

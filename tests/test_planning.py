@@ -359,3 +359,19 @@ def test_cores_are_those_this_process_may_use(monkeypatch):
     assert fac.cores() == 3 and fac.useful_workers(6) == 2
     monkeypatch.delattr(os, "sched_getaffinity")
     assert fac.cores() == 64
+
+
+@pytest.mark.parametrize("output", ["sampled", "mean"])
+@pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.parametrize("odd", [
+    {"samples": 1}, {"elites": 16}, {"elites": 1}, {"iterations": 1}, {"horizon": 0},
+    {"inverse_temperature": 0.0}, {"momentum": 1.0}, {"discount": 0.0}, {"pi_trajs": 1},
+    {"min_std": 2.0}, {"returns": "plain"}])
+def test_odd_settings_plan_all_the_same(odd, n, output):
+    """Also where all returns are equal, as those of a model without rewards and values."""
+    config = fac.PlannerConfig(**{"samples": 16, "iterations": 2, "output": output, **odd})
+    for model in (random_model(n), fac.WorldModel.create(random_model(n).config,
+                                                         np.random.default_rng(0))):
+        with fac.Planner(model, config, seed=0) as planner:
+            actions = np.stack([planner.act(np.ones(8)) for _ in range(3)])
+        assert actions.shape == (3, 3) and np.isfinite(actions).all() and np.abs(actions).max() <= 1
