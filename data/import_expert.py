@@ -15,11 +15,9 @@ nothing in it can be run, imported or written. What a file declares (members, si
 strides) is checked against the bytes that it has. Memory stays below three times the unpacked
 file (MAX_BYTES, MAX_RATIO), 12 bytes a weight (MAX_WEIGHTS) and 32 MiB.
 """
-import argparse
 import contextlib
 import dataclasses
 import io
-import json
 import math
 import pickletools
 import re
@@ -434,6 +432,7 @@ def run(args):
     if arrays or environment:
         replay = fac.Replay(out / "replay.npz")
         result.update(episodes=len(replay.ends), transitions=replay.transitions)
+    print(report(result), file=sys.stderr)
     return result
 
 
@@ -448,7 +447,7 @@ def report(result):
                   f"{MAX_NOISE} on the actions"]
     if not result["policy"]:
         lines += ["no policy (_pi): planning goes without its proposals, which costs the expert "
-                  "return; distilling doesn't need it"]
+                  "return; distill needs --own-episodes 0"]
     if not episodes:
         lines += [f"distill needs --replay FILE beside --expert {result['out']}/expert.npz, or run "
                   f"this again with --collect {LEAST_EPISODES}"]
@@ -460,7 +459,7 @@ def report(result):
 
 def main(argv=None):
     """Run the command line; returns the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = fac.Parser(prog="import_expert.py", description=__doc__.split("\n")[0])
     parser.add_argument("file", metavar="FILE", help="checkpoint: " + ", ".join(READERS))
     parser.add_argument("--task", required=True, help="one of: " + ", ".join(fac.TASKS))
     parser.add_argument("--out", required=True, help="folder for expert.npz and replay.npz")
@@ -471,21 +470,11 @@ def main(argv=None):
     parser.add_argument("--seed", type=fac.natural, default=0, help="of these episodes [0]")
     parser.add_argument("--json", action="store_true",
                         help="print one JSON object as the last line of stdout")
+    parser.set_defaults(run=run)
     try:
-        args = parser.parse_args(argv)
-        result = run(args)
+        return fac.run_command(parser, argv)
     except SystemExit as stop:  # --help, or a flag that isn't one
         return stop.code
-    except (fac.UserError, MemoryError) as error:
-        print(f"import_expert.py: error: {str(error) or 'not enough memory'}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("import_expert.py: interrupted", file=sys.stderr)
-        return 130
-    print(report(result), file=sys.stderr)
-    if args.json:
-        print(json.dumps(result))
-    return 0
 
 
 if __name__ == "__main__":
