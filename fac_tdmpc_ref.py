@@ -18,8 +18,8 @@ the case N = 1. There is one world model, one planner, one loss. The axes, every
     m   latent features of an agent
     d   action dimensions of an agent: dim(A) / N
     O   observation features;   A = N * d   action dimensions
-    B   batch;   S   action sequences (both always the last axis)
-    K   noise samples of the distillation loss (behind B)
+    B   batch;   S   action sequences (the last axis)
+    K   noise samples of the distillation loss (behind B): actions are (L, A, B, K) there
     H   horizon: H rewards, then Q;   L   actions of a sequence: H + 1 in Equations 2 and 4
 
 A layer is W (N, out, in), b (N, out, 1) and computes W @ x + b on x (N, in, B): samples last, so
@@ -146,7 +146,7 @@ class PlannerConfig(Settings):
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)", above=0)
     max_std: float = field(2.0, "first and largest sampling deviation (Table 2)", above=0)
     inverse_temperature: float = field(0.5, "an elite weighs exp(this * G); the `temperature` of "
-                                       "Table 2, by which TD-MPC's code multiplies", least=0)
+                                       "Table 2, by which TD-MPC's code multiplies", above=0)
     momentum: float = field(0.1, "part of the old mean in the new (TD-MPC's code)", least=0, most=1)
     returns: str = field("fast", "Equation 2 as it reads (plain: h_step_return), or the same, fast",
                          choices=("fast", "plain"))
@@ -467,7 +467,7 @@ class WorldModel:
         return "_pi.0.weight" in self.params
 
     def agents(self, i, j):
-        """The model of agents i..j-1 alone: what a planning worker needs (no encoder)."""
+        """The model of agents i..j-1 alone, without encoder and policy; the whole if it's all."""
         if j - i == self.config.num_agents:
             return self
         config = dataclasses.replace(self.config, num_agents=j - i,
@@ -621,7 +621,7 @@ def distill_loss(student, features, actions, targets, config, grads=None):
 
 
 def new_student(expert, num_agents, config, seed):
-    """A fresh student of an expert, and the optimizer that holds its trained weights.
+    """Adam on the trained weights of a fresh student of an expert, and that student.
 
     Where the student reads the expert's latent, it shares the expert's own encoder arrays [D3]."""
     sizes = student_config(expert.config, num_agents, config.sizes, config.encoder_input)
@@ -704,7 +704,7 @@ class Distiller:
         """Step t's part of its pool, which is gone through `reuse` times, in another order each:
         features, perturbed actions and targets, as `perturbed_batch`."""
         size, reuse = self.config.batch_size, self.config.reuse
-        number, i = divmod(t, reuse * self.pool_size // size)  # steps that a pool lasts
+        number, step = divmod(t, reuse * self.pool_size // size)  # which pool, which of its steps
         if number != self._number:
             sizes = np.diff(np.r_[0:self.pool_size:PART, self.pool_size])
             features, actions, targets = zip(*self._threads.map(
@@ -713,7 +713,7 @@ class Distiller:
                           [np.concatenate(target, 1) for target in zip(*targets)])
             rng, self._number = stream(self.seed, "order", number), number
             self._order = np.concatenate([rng.permutation(self.pool_size) for _ in range(reuse)])
-        chosen = self._order[i * size:(i + 1) * size]
+        chosen = self._order[step * size:(step + 1) * size]
         features, actions, targets = self._pool
         return features[..., chosen], actions[:, :, chosen], [x[:, chosen] for x in targets]
 
@@ -721,12 +721,12 @@ class Distiller:
         """Lines 4 to 6 once. Returns loss, mean reward divergence, mean value divergence."""
         features, actions, targets = self.batch(self.t)
 
-        def learn(half, part):
+        def learn(gradient_and_views, part):
             return distill_loss(self.student, features[..., part], actions[:, :, part],
-                                [x[:, part] for x in targets], self.config, half[1])
+                                [x[:, part] for x in targets], self.config, gradient_and_views[1])
 
         size, total = self.config.batch_size, np.zeros(3)
-        parts = [slice(0, -(-size // 2)), slice(-(-size // 2), size)][:size]
+        parts = [slice(0, -(-size // 2)), slice(-(-size // 2), size)][:size]  # one of a batch of 1
         for part, (gradient, _), losses in zip(parts, self._halves,
                                                self._threads.map(learn, self._halves, parts)):
             fraction = (part.stop - part.start) / size
@@ -788,13 +788,13 @@ def horizon_returns(rewards, q1, q2, discount):
     return np.cumsum(gamma * rewards, 0) - gamma * rewards + gamma * (q1 + q2) / 2
 
 
-def rank_correlation(distiller, states, seed, discount=0.99):
+def rank_correlation(distiller, states, discount=0.99):
     """How alike student and expert order perturbed actions, which is what the loss asks for.
 
     Spearman's correlation over 32 action sequences, mean over `states` held-out states; 1 is the
     same order (section 4.4). Returns that of the global Q at each step h of the rollout, and that
     of the global return G (Equation 2), by which planning ranks, for each H: two (L,)."""
-    rng = stream(seed, "rank correlation")
+    rng = stream(distiller.seed, "rank correlation")
     starts = rng.choice(distiller.held_out_starts, states)
     student, config = distiller.student, dataclasses.replace(distiller.config, noise_samples=32)
     sequences = distiller.replay.sequences(starts, config.horizon + 1)
@@ -1199,8 +1199,8 @@ TASKS = {
 REACHER_TARGET = {"easy": 0.05, "hard": 0.015}  # radius of the target, metres
 FINGER_RADIUS, REACHER_LINK = 0.01, 0.09
 
-# dm_control's reacher has two links; the paper's has three. Three links of 9 cm, the two
-# inner joints stop at 80 degrees, nothing collides, the task is the two-link one's.
+# dm_control's reacher has two links; the paper's has three. Three links of 9 cm, the second and
+# third joint stop at 80 degrees, nothing collides, the task is the two-link one's.
 REACHER_XML = f"""
 <mujoco model="three-link planar reacher">
   <compiler angle="degree"/>
@@ -1501,7 +1501,7 @@ def decisions(model, task, config, seeds):
 
 
 def _playing_worker(connection):
-    """Sends the decisions of its episodes, 25 at a time."""
+    """Sends the decisions of its episodes, 25 at a time, which divides EPISODE_STEPS."""
     played = decisions(*connection.recv())
     while part := list(itertools.islice(played, 25)):
         connection.send(part)
@@ -1612,7 +1612,7 @@ def train_student(distiller, out, settings, playing, workers):
             if distiller.t % every and distiller.t < config.steps:
                 continue
             means, losses = np.mean(losses, 0).tolist(), []
-            q, g = (x.tolist() for x in rank_correlation(distiller, 64, distiller.seed))
+            q, g = (x.tolist() for x in rank_correlation(distiller, 64, playing.discount))
             check_finite({"weights are": distiller.optimizer.vector,
                           "student's predictions are": q}, distiller.t, config.lr)
             seconds = before + time.time() - began
@@ -1736,7 +1736,7 @@ def command_distill(args):
     out.mkdir(parents=True, exist_ok=True)
     with contextlib.closing(Distiller(expert, replay, config, args.num_agents,
                                       args.seed)) as distiller:
-        result = distil(distiller, args, planning, header, out)
+        result = distil_and_save(distiller, args, planning, header, out)
     obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
     result.update(evaluate_both(expert, path, distiller.student, args, planning))
     result.update(time_both(expert, distiller.student, planning, obs))
@@ -1763,7 +1763,7 @@ def load_data(args):
     return expert, header, Replay(args.replay or data_file(args.task, "replay.npz")), path
 
 
-def distil(distiller, args, planning, header, out):
+def distil_and_save(distiller, args, planning, header, out):
     """Algorithm 1 to its end; writes student, curve and configuration. Returns result's part."""
     student, config, replay = distiller.student, distiller.config, distiller.replay
     playing = dataclasses.replace(planning, samples=64, iterations=3)
@@ -1777,7 +1777,7 @@ def distil(distiller, args, planning, header, out):
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
     curve, seconds = train_student(distiller, out, settings, playing, args.workers)
-    q, g = (x.tolist() for x in rank_correlation(distiller, 256, args.seed, planning.discount))
+    q, g = (x.tolist() for x in rank_correlation(distiller, 256, planning.discount))
     save_model(out / "student.npz", student, {"kind": "student", **settings,
                                               "training": header.get("training", {})})
     write_json(out / "config.json", {**settings, "planner": asdict(planning)})
@@ -1791,7 +1791,7 @@ def distil(distiller, args, planning, header, out):
 def evaluate_both(expert, path, student, args, planning):
     """The student's returns and the expert's, recorded or measured: result's part."""
     where = args.episodes, args.eval_seed, args.workers
-    theirs = evaluate(student, args.task, planning, *where, "evaluating the student")["returns"]
+    own = evaluate(student, args.task, planning, *where, "evaluating the student")["returns"]
     record = read_records(path).get(record_key(expert, planning, args.eval_seed), [])
     recorded = len(record) >= args.episodes and not args.evaluate_expert
     returns = record[:args.episodes] if recorded else evaluate(
@@ -1799,9 +1799,9 @@ def evaluate_both(expert, path, student, args, planning):
     return {"episodes": args.episodes, "expert_recorded": recorded,
             "expert_return_mean": float(np.mean(returns)),
             "expert_return_std": float(np.std(returns)), "expert_returns": returns,
-            "student_return_mean": float(np.mean(theirs)),
-            "student_return_std": float(np.std(theirs)), "student_returns": theirs,
-            "kept": return_kept(np.mean(theirs), np.mean(returns))}
+            "student_return_mean": float(np.mean(own)),
+            "student_return_std": float(np.std(own)), "student_returns": own,
+            "kept": return_kept(np.mean(own), np.mean(returns))}
 
 
 def time_both(expert, student, planning, obs):

@@ -387,7 +387,7 @@ def find_replay(path, sizes):
 
 def collect(model, environment, episodes, seed):
     """A buffer of episodes that the model plays, each with noise of another deviation."""
-    planning = fac.PlannerConfig(samples=128, iterations=4)  # takes a fifth of the default's time
+    planning = fac.PlannerConfig(samples=128, iterations=4)
     decisions = episodes * fac.EPISODE_STEPS
     buffer = ReplayBuffer(environment.dim_obs, environment.dim_action, decisions)
     with fac.Planner(model, planning) as planner, \

@@ -14,7 +14,8 @@ import sys
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "data")]
 
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
@@ -22,6 +23,7 @@ import torch.nn.functional as F  # noqa: E402
 
 import fac_tdmpc_ref as fac  # noqa: E402
 import numpy_learner  # noqa: E402
+from torch_learner import TorchLearner  # noqa: E402
 
 
 def run_network(kinds, params, name, x):
@@ -208,8 +210,6 @@ def distillation(threads, turns):
 
 def training(threads, turns, batch=256):
     """(ratio, our ms, PyTorch's ms) of an update of Equation 1, policy and averages included."""
-    sys.path.insert(0, str(fac.DATA))
-    from torch_learner import TorchLearner
     config, rng = numpy_learner.ExpertConfig(batch_size=batch), np.random.default_rng(0)
     ours = numpy_learner.Learner(fac.ModelConfig(24, 6), config, rng)
     theirs = TorchLearner(fac.WorldModel.create(ours.model.config, rng, policy=True), config, "cpu")

@@ -365,7 +365,7 @@ def test_cores_are_those_this_process_may_use(monkeypatch):
 @pytest.mark.parametrize("n", [1, 3])
 @pytest.mark.parametrize("odd", [
     {"samples": 1}, {"elites": 16}, {"elites": 1}, {"iterations": 1}, {"horizon": 0},
-    {"inverse_temperature": 0.0}, {"momentum": 1.0}, {"discount": 0.0}, {"pi_trajs": 1},
+    {"inverse_temperature": 1e-9}, {"momentum": 1.0}, {"discount": 0.0}, {"pi_trajs": 1},
     {"min_std": 2.0}, {"returns": "plain"}])
 def test_odd_settings_plan_all_the_same(odd, n, output):
     """Also where all returns are equal, as those of a model without rewards and values."""
