@@ -1828,7 +1828,7 @@ def report(result, planning, eval_seed):
     rows = [(f"expert ({source}), one process", expert, result["plan_ms_expert"]),
             (f"student, N = {result['num_agents']}, one process", student,
              result["plan_ms_student_in_process"]),
-            (f"student, with {result['plan_workers']} beside", "the same plans",
+            (f"student, workers beside: {result['plan_workers']}", "the same plans",
              result["plan_ms_student"])][:3 if result["plan_workers"] else 2]
     print(f"\n{result['task']}, {result['episodes']} episodes, evaluation seed {eval_seed}, MPPI "
           f"with {planning.samples} samples, {planning.iterations} iterations, horizon "
