@@ -481,8 +481,8 @@ def policy_rollout(model, z, noise):
     (N, m, B) on, which its own dynamics roll out."""
     actions = []
     for eps in noise:
+        z = model.next(z, actions[-1]) if actions else z
         actions.append(np.clip(model.policy(z) + eps, -1, 1))
-        z = model.next(z, actions[-1])
     return np.stack(actions)
 
 
@@ -1362,8 +1362,9 @@ def read_npz(path, kind):
                         ) from None
     try:
         header = json.loads(arrays.pop("header").tobytes())
-        need(isinstance(header, dict), "")
-    except (KeyError, ValueError, UserError):
+        if not isinstance(header, dict):
+            raise ValueError
+    except (KeyError, ValueError):
         raise UserError(f"{path}: header: expected a JSON entry of this name, found none; files "
                         f"are made by data/train_expert.py and distill") from None
     need(header.get("format") == FORMAT, f"{path}: header: format: expected {FORMAT!r}, found "
@@ -1505,7 +1506,6 @@ def _playing_worker(connection):
     played = decisions(*connection.recv())
     while part := list(itertools.islice(played, 25)):
         connection.send(part)
-    connection.recv()  # until the pipe is closed
 
 
 def play(model, task, config, seeds, workers=None, label="playing"):

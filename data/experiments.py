@@ -142,7 +142,9 @@ def benchmark_decisions(robot, workers, planning, rounds):
         seconds = fac.interleaved_seconds(
             [gemm, *(functools.partial(subject[-1], obs) for subject in subjects)], rounds,
             f"{robot}: decisions")
-        hand_over = fac.interleaved_seconds([HandOver(stack, workers)], 200, f"{robot}: hand-over")
+        echo = stack.enter_context(fac.Workers(_echo_worker, workers, "echo worker"))
+        hand_over = fac.interleaved_seconds([functools.partial(wake, echo)], 200,
+                                            f"{robot}: hand-over")
     multiply_add = float(np.median(seconds[:, 0])) / 512 ** 3
     rows = []
     for (model, preset, mode, measured, config, _), s in zip(subjects, seconds.T[1:]):
@@ -154,15 +156,10 @@ def benchmark_decisions(robot, workers, planning, rounds):
     return rows, 1e6 * float(np.median(hand_over)) if workers else None
 
 
-class HandOver:
-    """Waking all workers and waiting for their answers, without planning: what a plan pays."""
-
-    def __init__(self, stack, workers):
-        self._workers = stack.enter_context(fac.Workers(_echo_worker, workers, "echo worker"))
-
-    def __call__(self):
-        self._workers.send_all(None)
-        self._workers.receive_all()
+def wake(workers):
+    """Wake all workers and wait for their answers, without planning: what a plan pays."""
+    workers.send_all(None)
+    workers.receive_all()
 
 
 def _echo_worker(connection):
@@ -301,13 +298,11 @@ def shares(model, z, config):
     return worth[:, 0] - worth[:, 1]
 
 
-def watch_episode(path, task, seed, decisions, every):
+def watch_episode(path, model, header, environment, seed, decisions, every):
     """Frames of a model's episode: picture, shares (N,) and return so far of each; and its name
     with the median milliseconds of a decision."""
-    model, header = fac.load_model(path)
-    fac.check_task(model.config, task)
     config = fac.PlannerConfig(**fac.made_for(header, path))
-    environment, frames, total, seconds = fac.Environment(task), [], 0.0, []
+    frames, total, seconds = [], 0.0, []
     with fac.Planner(model, config) as planner, fac.progress(f"playing {path}", decisions,
                                                              "decision") as bar:
         planner.reset(seed)
@@ -352,17 +347,19 @@ def draw_frames(episodes):
 
 def command_watch(args):
     """watch: an episode as a moving picture."""
-    if Path(args.out).suffix != ".gif":
-        raise fac.UserError(f"{args.out}: expected a name that ends in .gif")
+    fac.need(Path(args.out).suffix == ".gif", f"{args.out}: expected a name that ends in .gif")
     fac.pyplot()  # brings Pillow
-    paths = [args.model] + ([args.beside] if args.beside else [])
-    task = args.task or fac.load_model(args.model)[1].get("task")
-    fac.lookup_task(task)
+    models = [(path, *fac.load_model(path)) for path in (args.model, args.beside) if path]
+    task = args.task or models[0][2].get("task")
+    for _, model, _ in models:
+        fac.check_task(model.config, task)
     choose_renderer()
+    environment = fac.Environment(task)
     seed = fac.episode_seeds(args.seed, args.episode + 1)[args.episode]
-    episodes = [watch_episode(path, task, seed, args.decisions, args.every) for path in paths]
+    episodes = [watch_episode(*found, environment, seed, args.decisions, args.every)
+                for found in models]
     images = [image.quantize(64) for image in draw_frames(episodes)]
-    seconds = fac.ACTION_REPEAT * fac.Environment(task).env.control_timestep() * args.every
+    seconds = fac.ACTION_REPEAT * environment.env.control_timestep() * args.every
     with fac.atomic_file(args.out) as file:
         images[0].save(file, format="gif", save_all=True, append_images=images[1:], loop=0,
                        duration=max(20, int(1e3 * seconds)))

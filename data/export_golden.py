@@ -23,7 +23,7 @@ try:
     import torch.nn.functional as F
     from torch_learner import equation_1, heads, network, policy, transition
 except ImportError:
-    pass  # `digest`, with which the golden files are read, doesn't need it
+    torch = None  # `digest`, with which the golden files are read, doesn't need it
 
 # golden files keep to the paper here, whatever the defaults are
 AS_PRINTED = {"horizon": 3, "lam": 0.5, "noise_std": 0.5, "noise_std_min": 0.5,
@@ -280,6 +280,7 @@ def main(argv=None):
     parser.add_argument("--data", type=Path, default=fac.DATA, help="their folder [data/]")
     args = parser.parse_args(argv)
     try:
+        fac.need(torch, "golden files hold what PyTorch computes: pip install torch")
         for task in args.tasks or sorted(p.parent.name for p in args.data.glob("*/expert.npz")):
             write_golden(args.data / task)
         write_narrow_golden(args.data / "golden-narrow.npz")

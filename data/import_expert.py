@@ -387,10 +387,9 @@ def find_replay(path, sizes):
 
 def collect(model, environment, episodes, seed):
     """A buffer of episodes that the model plays, each with noise of another deviation."""
-    planning = fac.PlannerConfig(samples=128, iterations=4)
     decisions = episodes * fac.EPISODE_STEPS
     buffer = ReplayBuffer(environment.dim_obs, environment.dim_action, decisions)
-    with fac.Planner(model, planning) as planner, \
+    with fac.Planner(model) as planner, \
             fac.progress("collecting", decisions, "decision") as bar:
         for i in range(episodes):
             rng = np.random.default_rng([seed, i])

@@ -268,7 +268,7 @@ class Training:
         self.student = distilling and OnlineStudent(self.learner.model, args.num_agents,
                                                     distilling, args.seed)
         self.buffer = ReplayBuffer(dim_obs, dim_action, config.buffer_size,
-                                       np.dtype(config.buffer_dtype))
+                                   np.dtype(config.buffer_dtype))
         self.decisions, self.allowed, self.seconds, self.curve = 0, 0.0, 0.0, []
         self.settings = {key: getattr(args, key) for key in (
             "task", "seed", "backend", "envs", "refresh", "evaluate_every", "num_agents")}
