@@ -139,7 +139,6 @@ def expert_golden(model, target, g, config):
     return found
 
 
-@torch.no_grad()
 def mppi_golden(model, g, planner):
     """One refinement of MPPI (Equation 2) for obs[0, :, 0] from a mean, with fixed noise."""
     params = {k: double(v) for k, v in model.items()}
