@@ -593,7 +593,7 @@ def soft_kl(student, expert, temperature_student, temperature_expert, kind="forw
     return kl, p_s * (gap - kl[..., None]) / temperature_student
 
 
-def distill_loss(student, features, actions, targets, config, grads=None):
+def distill_loss(student, features, actions, targets, config, grads=None, divergence=soft_kl):
     """The loss in line 6 of Algorithm 1 and, into the dict `grads`, its gradients.
 
         mean over B of sum_h lambda^h [c_R D(R_h) + c_Q (D(Q1_h) + D(Q2_h))]
@@ -609,8 +609,8 @@ def distill_loss(student, features, actions, targets, config, grads=None):
     loss, means, d_outputs = 0.0, [], []
     coefs = (config.reward_coef, config.value_coef, config.value_coef)
     for coef, output, target in zip(coefs, outputs, targets):
-        kl, d_output = soft_kl(output, target, config.temperature_student,
-                               config.temperature_expert, config.kl)
+        kl, d_output = divergence(output, target, config.temperature_student,
+                                  config.temperature_expert, config.kl)
         loss += coef * float((weights * kl).sum())
         means.append(float(kl.mean()))
         d_outputs.append(coef * weights[..., None] * d_output)
@@ -620,11 +620,10 @@ def distill_loss(student, features, actions, targets, config, grads=None):
     return loss, means[0], (means[1] + means[2]) / 2
 
 
-def new_student(expert, num_agents, config, seed):
+def new_student(expert, sizes, config, seed):
     """Adam on the trained weights of a fresh student of an expert, and that student.
 
     Where the student reads the expert's latent, it shares the expert's own encoder arrays [D3]."""
-    sizes = student_config(expert.config, num_agents, config.sizes, config.encoder_input)
     student = WorldModel.create(sizes, stream(seed, "student"))
     frozen = {"_expert" + k: v for k, v in expert.params.items()
               if k.startswith("_encoder.") and config.encoder_input == "latent"}
@@ -664,21 +663,24 @@ class Distiller:
 
     The expert is frozen: what it predicts for a pool of states and their perturbed actions is
     computed once and learned from `reuse` times. Two threads share that, and each step's batch:
-    NumPy lets go of the interpreter inside its products."""
+    NumPy lets go of the interpreter inside its products. sizes: a ModelConfig to override its."""
 
-    def __init__(self, expert, replay, config, num_agents=None, seed=0):
-        sizes = expert.config
+    loss = staticmethod(distill_loss)
+
+    def __init__(self, expert, replay, config, num_agents=None, seed=0, sizes=None):
+        theirs = expert.config
         self.train_starts, self.held_out_starts = replay.starts(config.horizon + 1, config.held_out)
-        need((replay.dim_obs, replay.dim_action) == (sizes.dim_obs, sizes.dim_action),
+        need((replay.dim_obs, replay.dim_action) == (theirs.dim_obs, theirs.dim_action),
              f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, {replay.dim_action}), the "
-             f"expert expects ({sizes.dim_obs}, {sizes.dim_action}); pass its own task's replay")
+             f"expert expects ({theirs.dim_obs}, {theirs.dim_action}); pass its own task's replay")
         self.expert, self.config, self.seed = expert, config, seed
         need(expert.has_policy or not config.own_episodes, "the expert has no policy, which says "
              "what to do in the student's own states; pass --own-episodes 0")
         self.replay, self.own = replay, np.zeros((0, replay.dim_obs), np.float16)  # states [D9]
-        agents = sizes.dim_action if num_agents is None else num_agents
+        agents = theirs.dim_action if num_agents is None else num_agents
         with one_thread():
-            self.optimizer, self.student = new_student(expert, agents, config, seed)
+            self.optimizer, self.student = new_student(expert, sizes or student_config(
+                theirs, agents, config.sizes, config.encoder_input), config, seed)
         needed = config.steps * config.batch_size // config.reuse
         self.pool_size = max(config.batch_size, min(POOL, needed))
         self._number = self._pool = None
@@ -722,7 +724,7 @@ class Distiller:
         features, actions, targets = self.batch(self.t)
 
         def learn(gradient_and_views, part):
-            return distill_loss(self.student, features[..., part], actions[:, :, part],
+            return self.loss(self.student, features[..., part], actions[:, :, part],
                                 [x[:, part] for x in targets], self.config, gradient_and_views[1])
 
         size, total = self.config.batch_size, np.zeros(3)
@@ -800,8 +802,6 @@ def rank_correlation(distiller, states, discount=0.99):
     sequences = distiller.replay.sequences(starts, config.horizon + 1)
     features, actions, expert = perturbed_batch(distiller.expert, student, *sequences, config, rng)
     own = predict(student, student.encode_features(features), actions)
-    if not np.isfinite(own).all():
-        return (np.full(len(actions), np.nan),) * 2
     return (spearman(expert[1] + expert[2], own[1] + own[2]).mean(-1),
             spearman(*(horizon_returns(*out, discount) for out in (expert, own))).mean(-1))
 
@@ -1485,10 +1485,10 @@ def data_file(task, name):
 # ==== 8. Commands =====================================================================
 
 
-def decisions(model, task, config, seeds):
+def decisions(model, task, config, seeds, environment=None):
     """Plan through the episode of each seed; yields every decision's observation (O,), action
-    (A,), reward and seconds of planning."""
-    environment, planner = Environment(task), Planner(model, config)
+    (A,), reward and seconds of planning. environment: to use instead of the task's own."""
+    environment, planner = environment or Environment(task), Planner(model, config)
     for seed in seeds:
         planner.reset(seed)
         obs = environment.reset(seed)

@@ -1,371 +1,666 @@
 #!/usr/bin/env python3
 """The paper's tables and figures, each by one command.
 
-    python data/experiments.py table3 --figure data/figures/prediction.png
+    python data/experiments.py table3 --figure data/figures/prediction.png   # and Figure 6
+    python data/experiments.py figure4 --tasks walker-run --seeds 0 1 2
+    python data/experiments.py report
 
-`table3` times the networks and whole decisions, centralized and factored, by threads and
-processes; `--figure` draws Figure 6 from it. `watch` plays an episode as a moving picture, of one
-model or two side by side. A client of fac_tdmpc_ref.py, which knows nothing of what is here.
+Figures 4 to 13 and `sweep` are lists of runs, each a task, a seed, a case and settings. Rows go to
+one CSV under data/results as runs end; the same command again makes those that are missing.
+`report` draws figures and tables from the CSVs alone. Table 3 is in speed.py, TAP in tap.py,
+section 5.6 in look.py. Clients of fac_tdmpc_ref.py, which knows nothing of what is here.
 """
 import contextlib
+import csv
 import dataclasses
 import functools
+import io
+import itertools
+import json
 import os
-import pickle
-import subprocess
 import sys
 import time
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import fac_tdmpc_ref as fac  # noqa: E402
+from look import STYLES, command_agreement, command_figure9, command_watch, styles  # noqa: E402
+from speed import ROBOTS, command_table3  # noqa: E402
 
-# ------------------------------------------------------------------ Table 3, Figure 6: speed
+# ------------------------------------------------------ runs, many at a time, each only once
 
-# robot: dim O, dim A (Figure 3), milliseconds of f_T, f_R, f_Q in TD-MPC and in Fac-TDMPC (Table 3)
-ROBOTS = {
-    "reacher": (8, 3, (5.83, 5.32, 11.73), (1.25, 1.02, 2.56)),
-    "hopper": (15, 4, (5.86, 5.34, 11.70), (0.83, 0.65, 1.71)),
-    "fish": (24, 5, (5.83, 5.26, 11.56), (0.77, 0.57, 1.53)),
-    "cheetah": (17, 6, (5.63, 5.06, 11.35), (0.75, 0.49, 1.34)),
-    "walker": (24, 6, (5.86, 5.28, 11.71), (0.72, 0.48, 1.32)),
-    "quadruped": (78, 12, (5.96, 5.34, 11.86), (0.63, 0.49, 0.96)),
-    "humanoid": (67, 21, (5.83, 5.25, 11.71), (0.42, 0.32, 0.69)),
-}
-FUNCTIONS = {"f_T": ("_dynamics",), "f_R": ("_reward",), "f_Q": ("_Q1", "_Q2")}
-TABLE3_BATCH = 512
-MODES = ("one-thread", "processes", "critical-path")
+RESULTS = fac.DATA / "results"
+KEY = ("task", "seed", "case", "settings")  # what a run is; the rest is what it found
+ROW = (*KEY, "step", "return_mean", "return_std", "return_min", "expert_mean", "rank_q",
+       "rank_return", "ms", "ms_workers", "minutes", "error")
 
 
-class Predictor:
-    """f_T, f_R and f_Q alone, on fixed inputs: predictor("f_T").
-
-    workers: processes beside this one that share the agents; their inputs are there already.
-    """
-
-    def __init__(self, model, workers=0):
-        mine, *theirs = fac.split_agents(model.config.num_agents, workers)
-        self.model = model.agents(mine.start, mine.stop)
-        sizes = self.model.config
-        self._x = np.random.default_rng(0).standard_normal(
-            (sizes.num_agents, sizes.latent_dim + sizes.agent_actions, TABLE3_BATCH), fac.F32)
-        self._workers = fac.Workers(_prediction_worker, workers, "prediction worker")
-        for i, share in enumerate(theirs):
-            self._workers.send(i, model.agents(share.start, share.stop))
-
-    def __call__(self, function):
-        self._workers.send_all(function)
-        kinds = fac.QNET if function == "f_Q" else fac.MLP
-        for name in FUNCTIONS[function]:
-            fac.forward(kinds, self.model.params, name, self._x)
-        self._workers.receive_all()
-
-    def close(self):
-        """End the worker processes."""
-        self._workers.close()
+def make_run(task, seed, case, **settings):
+    """A run as its rows begin: settings, of which None means not set, as JSON."""
+    settings = {k: v for k, v in settings.items() if v is not None}
+    return {"task": task, "seed": str(seed), "case": case,
+            "settings": json.dumps(settings, sort_keys=True)}
 
 
-def _prediction_worker(connection):
-    predict, done = Predictor(connection.recv()), pickle.dumps(None)
-    while True:
-        predict(connection.recv())
-        connection.send_bytes(done)
+def read_rows(path):
+    """A CSV's rows, dicts of strings; without a line that a kill cut off."""
+    if not Path(path).exists():
+        return []
+    head, *lines = [next(csv.reader([line]), []) for line in  # one by one: a cut one has no end
+                    Path(path).read_text(encoding="utf-8").splitlines() or [""]]
+    fac.need(tuple(head) == ROW, f"{path}: expected the columns {','.join(ROW)}, found "
+             f"{','.join(head)}; choose another --out")
+    return [dict(zip(ROW, line)) for line in lines if len(line) == len(ROW)]
 
 
-def multiply_adds(config, planner):
-    """Multiply-adds of a decision's networks, as Equation 2 reads (none saved)."""
-    cost = {name: agents * sum(a * b for a, b in zip(widths, widths[1:]))
-            for name, _, agents, widths in fac.networks(config)}
-    step, value = cost["_dynamics"] + cost["_reward"], cost["_Q1"] + cost["_Q2"]
-    return planner.samples * planner.iterations * (planner.horizon * step + value)
+def append_rows(path, rows):
+    """Add a run's rows to a CSV in one write."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, ROW)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "a+b") as file:
+        file.seek(0, os.SEEK_END)
+        if not file.tell():
+            writer.writeheader()
+        else:
+            file.seek(-1, os.SEEK_END)
+            text.write("" if file.read() == b"\n" else "\n")  # ends a line that was cut off
+        writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()}
+                         for row in rows)
+        file.write(text.getvalue().encode())
 
 
-def benchmark_prediction(robot, workers, runs):
-    """Table 3 for one robot: rows of robot, model, function, mode, ms_mean, ms_std."""
-    _, n, *_ = ROBOTS[robot]
-    factored = random_model(robot, n, 512 // n, 512 // n)
-    with contextlib.ExitStack() as stack:
-        def predictor(*args):
-            return stack.enter_context(contextlib.closing(Predictor(*args)))
-
-        subjects = [("TD-MPC", "one-thread", predictor(random_model(robot, 1, 512, 512))),
-                    ("10% TD-MPC", "one-thread", predictor(random_model(robot, 1, 512, 66))),
-                    ("TAP", "one-thread", predictor(random_model(robot, 1, 512, 512, 2))),
-                    ("Fac-TDMPC", "one-thread", predictor(factored)),
-                    ("Fac-TDMPC", "processes", predictor(factored, workers)),
-                    ("Fac-TDMPC", "critical-path", predictor(factored.agents(0, 1)))]
-        calls = [(model, mode, f, functools.partial(predict, f))
-                 for model, mode, predict in subjects for f in FUNCTIONS]
-        seconds = fac.interleaved_seconds([call[-1] for call in calls], runs,
-                                          f"{robot}: networks")
-    return [{"robot": robot, "model": model, "function": f, "mode": mode,
-             "ms_mean": 1e3 * float(s.mean()), "ms_std": 1e3 * float(s.std())}
-            for (model, mode, f, _), s in zip(calls, seconds.T)]
+def finished(rows):
+    """Rows of runs that came to their end, by run: {(task, seed, case, settings): rows}."""
+    runs = {}
+    for row in rows:
+        runs.setdefault(tuple(row[k] for k in KEY), []).append(row)
+    return {key: found for key, found in runs.items() if any(row["minutes"] for row in found)}
 
 
-MATRIX = np.ones((512, 512), fac.F32)
+def attempt(function, run):
+    """A run's rows; one that fails is a row with its error."""
+    os.environ["TQDM_DISABLE"] = "1"  # a worker's own bars
+    began = time.time()
+    with fac.one_thread():
+        try:
+            found = list(function(run["task"], int(run["seed"]), run["case"],
+                                  json.loads(run["settings"])))
+            found[-1]["minutes"] = (time.time() - began) / 60
+        except Exception as error:
+            found = [{"error": f"{type(error).__name__}: {' '.join(str(error).split())}"}]
+    return [{**run, **row} for row in found]
 
 
-def gemm():
-    """A product of 512 x 512 matrices: the machine's rate, which sets the floor."""
-    return MATRIX @ MATRIX
+def run_all(args, function, runs):
+    """function(task, seed, case, settings), rows, of all runs that the CSV doesn't hold; result."""
+    try:
+        import joblib
+    except ImportError:
+        raise fac.UserError("experiments need joblib: pip install 'fac-tdmpc-ref[experiments]'"
+                            ) from None
+    for task in args.tasks:
+        fac.lookup_task(task)
+    path = Path(args.out or RESULTS / f"{args.command}.csv")
+    done = finished(read_rows(path))
+    todo = [run for run in runs if tuple(run.values()) not in done]
+    failed, where = [], connect(args)
+    with fac.progress(args.command, len(runs), "run", len(runs) - len(todo)) as bar, \
+            joblib.parallel_config(**where):
+        parallel = joblib.Parallel(args.jobs, return_as="generator_unordered")
+        for rows in parallel(joblib.delayed(attempt)(function, run) for run in todo):
+            append_rows(path, rows)
+            failed += [row["error"] for row in rows if row.get("error")]
+            bar.update()
+    for error in failed:
+        print(f"failed: {error}", file=sys.stderr)
+    print(f"{path}: {len(runs)} runs, {len(todo)} of them now, {len(failed)} failed")
+    return {"out": str(path), "runs": len(runs), "now": len(todo), "failed": len(failed)}
 
 
-def benchmark_decisions(robot, workers, planning, rounds):
-    """Whole decisions for one robot: rows of robot, model, preset, mode, samples, iterations,
-    ms_median, floor_ms, ratio_to_floor; and the microseconds of a hand-over to the workers."""
-    _, n, *_ = ROBOTS[robot]
-    obs = np.random.default_rng(0).standard_normal(ROBOTS[robot][0], fac.F32)
-    budgets = [planning] + [dataclasses.replace(planning, **{name: value})
-                            for name, value in (("samples", 128), ("iterations", 2))  # Figure 7
-                            if getattr(planning, name) != value]
-    presets = {"table2": ((50, 512), (50, max(512 // n, 50))),
-               "section51": ((512, 512), (512 // n, 512 // n))}
-    subjects = []
-    with contextlib.ExitStack() as stack:
-        def planner(model, config, workers=0):
-            return stack.enter_context(fac.Planner(model, config, workers=workers))
-
-        for preset, (central, factored) in presets.items():
-            central, factored = random_model(robot, 1, *central), random_model(robot, n, *factored)
-            for config in budgets:
-                parallel = planner(factored, config, workers)
-                subjects += [
-                    ("TD-MPC", preset, "one-thread", central, config, planner(central, config).act),
-                    ("Fac-TDMPC", preset, "one-thread", factored, config,
-                     planner(factored, config).act),
-                    ("Fac-TDMPC", preset, "processes", factored, config, parallel.act),
-                    ("Fac-TDMPC", preset, "critical-path", factored.agents(0, 1), config,
-                     one_agent(factored, config))]
-        seconds = fac.interleaved_seconds(
-            [gemm, *(functools.partial(subject[-1], obs) for subject in subjects)], rounds,
-            f"{robot}: decisions")
-        echo = stack.enter_context(fac.Workers(_echo_worker, workers, "echo worker"))
-        hand_over = fac.interleaved_seconds([functools.partial(wake, echo)], 200,
-                                            f"{robot}: hand-over")
-    multiply_add = float(np.median(seconds[:, 0])) / 512 ** 3
-    rows = []
-    for (model, preset, mode, measured, config, _), s in zip(subjects, seconds.T[1:]):
-        ms = 1e3 * float(np.median(s))
-        floor = 1e3 * multiply_add * multiply_adds(measured.config, config)
-        rows.append({"robot": robot, "model": model, "preset": preset, "mode": mode,
-                     "samples": config.samples, "iterations": config.iterations,
-                     "ms_median": ms, "floor_ms": floor, "ratio_to_floor": ms / floor})
-    return rows, 1e6 * float(np.median(hand_over)) if workers else None
+def connect(args):
+    """joblib's arguments for where runs run: processes here, or a dask or ray cluster."""
+    backend, address = getattr(args, "backend", None), getattr(args, "scheduler", None)
+    try:
+        if backend == "dask":
+            from dask.distributed import Client
+            fac.need(address, "--backend dask needs --scheduler tcp://HOST:PORT")
+            Client(address, timeout=10)
+        elif backend == "ray":
+            import ray
+            from ray.util.joblib import register_ray
+            ray.init(address, ignore_reinit_error=True)
+            register_ray()
+    except ImportError:
+        raise fac.UserError(f"--backend {backend} needs it: pip install "
+                            "'fac-tdmpc-ref[cluster]'") from None
+    except (OSError, ConnectionError) as error:
+        raise fac.UserError(f"--scheduler {address}: {error}") from None
+    return {"backend": backend or "loky"}
 
 
-def wake(workers):
-    """Wake all workers and wait for their answers, without planning: what a plan pays."""
-    workers.send_all(None)
-    workers.receive_all()
+def episodes(model, task, planning, seeds, environment=None):
+    """Observations (E, T, O) and returns (E,) of a model's episodes, in this process."""
+    obs, _, rewards, _ = zip(*fac.decisions(model, task, planning, seeds, environment))
+    return (np.reshape(obs, (len(seeds), fac.EPISODE_STEPS, -1)),
+            np.reshape(rewards, (len(seeds), -1)).sum(1))
 
 
-def _echo_worker(connection):
-    while True:
-        connection.send(connection.recv())
+def summary(returns):
+    """A row's columns of episodes' returns."""
+    return {"return_mean": float(returns.mean()), "return_std": float(returns.std()),
+            "return_min": float(returns.min())}
 
 
-def one_agent(model, config):
-    """A decision's critical path: the encoder, then the plan of one agent (all are of one size)."""
-    alone = fac.AgentPlanner(model.agents(0, 1), config)
-    alone.reset(np.random.SeedSequence(0).spawn(1))
-    return lambda obs: alone.plan(model.encode(obs[:, None])[:1])
+# ------------------------------------------------- Figures 4, 5, 13 and sweeps: distillation
+
+def squared_error(student, expert, *_):
+    """Mean of (student - expert)^2 over the K predictions and its gradient: MSE for `soft_kl`."""
+    error = student - expert
+    return (error ** 2).mean(-1), 2 * error / error.shape[-1]
 
 
-def random_model(robot, num_agents, latent_dim, mlp_dim, dim_action=None):
-    """A model of a robot's dimensions with fresh weights."""
-    dim_obs, actions, *_ = ROBOTS[robot]
-    sizes = fac.ModelConfig(dim_obs, dim_action or actions, num_agents, latent_dim, 256, mlp_dim)
-    return fac.WorldModel.create(sizes, np.random.default_rng(0))
+class MSEDistiller(fac.Distiller):
+    """Figure 5: values, not rankings."""
+
+    loss = staticmethod(functools.partial(fac.distill_loss, divergence=squared_error))
 
 
-def speedups(prediction, decision, planning):
-    """TD-MPC's time over Fac-TDMPC's: rows of robot, function, mode, value, paper (Table 3)."""
-    ms = {(r["robot"], r["function"], r["model"], r["mode"]): r["ms_mean"] for r in prediction}
-    ms.update({(r["robot"], "decision", r["model"], r["mode"]): r["ms_median"] for r in decision
-               if (r["preset"], r["samples"], r["iterations"]) ==
-               ("section51", planning.samples, planning.iterations)})
-    paper = {(robot, f): central / factored for robot, (_, _, *times) in ROBOTS.items()
-             for f, central, factored in zip(FUNCTIONS, *times)}
-    return [{"robot": robot, "function": f, "mode": mode,
-             "value": value / ms[robot, f, "Fac-TDMPC", mode], "paper": paper.get((robot, f))}
-            for (robot, f, model, _), value in ms.items() if model == "TD-MPC" for mode in MODES]
+def consistency_loss(student, features, actions, targets, config, grads=None):
+    """Equation 4 and, with weight 2 (Table 2's for experts), TD-MPC's consistency.
+
+    That is the mean of |s_{h+1} - f_E(g_{h+1})|^2 over features, with the student's encoding,
+    held fixed, of the last of `targets`: what the student reads of the expert's own rollout."""
+    *targets, after = targets  # (L, B, K, F)
+    tapes, encoder_tape, weight = defaultdict(list), [], 2.0
+    loss, *means = fac.distill_loss(student, features, actions, targets, config, grads)
+    z = student.encode_features(features, encoder_tape)
+    steps, _, batch, noise = actions.shape
+    x, end = fac.unroll(student, z, actions, steps, tapes)
+    n, m = student.config.num_agents, student.config.latent_dim
+    own = np.concatenate([x[:, :m, batch * noise:], end], 2)
+    goal = student.encode_features(np.ascontiguousarray(after.reshape(1, -1, after.shape[-1])
+                                                        .swapaxes(1, 2)))
+    lam = np.repeat(config.lam ** np.arange(steps), batch * noise).astype(z.dtype)
+    gap, scale = own - goal, weight / (n * m * batch * noise)
+    if grads is not None:
+        d_latents = (2 * scale * lam * gap).reshape(n, m, steps, -1).transpose(2, 0, 1, 3)
+        outputs = fac.run_heads(student, x, actions, tapes)
+        dz = fac.predict_backward(student, tapes, [np.zeros_like(y) for y in outputs], grads,
+                                  d_latents)
+        fac.backward(fac.ENCODER, student.params, "_encoder", encoder_tape,
+                     dz.reshape(1, -1, batch), grads)
+    return loss + float(scale * (lam * gap ** 2).sum()), *means
 
 
-def command_table3(args):
-    """table3: the networks and whole decisions on this machine."""
-    planning = fac.from_args(fac.PlannerConfig, args, **fac.paper_preset(fac.PlannerConfig))
-    args.robots = list(dict.fromkeys(args.robots))
-    for robot in args.robots:
-        if robot not in ROBOTS:
-            raise fac.UserError(f"unknown robot {robot!r}; known: {', '.join(ROBOTS)}")
-    if args.runs < 10:
-        raise fac.UserError(f"runs must be at least 10, not {args.runs}")
-    if args.figure:
-        fac.pyplot()  # before the work, not after it
-    prediction, decision, hand_overs = [], [], []
-    for robot in args.robots:
-        agents = ROBOTS[robot][1]
-        workers = (fac.useful_workers(agents) if args.workers is None
-                   else min(args.workers, agents - 1))
-        prediction += benchmark_prediction(robot, workers, args.runs)
-        rows, hand_over = benchmark_decisions(robot, workers, planning, args.runs // 10)
-        decision += rows
-        hand_overs += [hand_over] * (hand_over is not None)
-    result = {"prediction": prediction, "decision": decision,
-              "speedup": speedups(prediction, decision, planning),
-              "handover_us": float(np.median(hand_overs)) if hand_overs else None,
-              "cores": fac.cores()}
-    print_benchmark(result, args.robots)
-    if args.figure:
-        draw_prediction(args.figure, prediction, args.robots)
+class ConsistentDistiller(fac.Distiller):
+    """Figure 5: with TD-MPC's consistency loss, along the expert's own rollout."""
+
+    loss = staticmethod(consistency_loss)
+
+    def draw(self, number, part, size):
+        """As Distiller's; the targets are followed by the expert's latents (L, B, K, F)."""
+        features, actions, targets = super().draw(number, part, size)
+        steps, _, *columns = actions.shape
+        fac.need(self.student.config.expert_latent_dim, "consistency needs encoder_input latent")
+        x, end = fac.unroll(self.expert, features, actions, steps)
+        after = np.concatenate([x[:, :features.shape[1], np.prod(columns):], end], 2)[0]
+        return features, actions, [*targets, after.T.reshape(steps, *columns, -1)]
+
+
+class SmallDistiller(fac.Distiller):
+    """B.2's 10% TD-MPC: centralized, hidden layers of 66 (9% of the weights with latents of 512,
+    3% with Table 2's of 50)."""
+
+    def __init__(self, expert, replay, config, num_agents=1, seed=0):
+        sizes = fac.student_config(expert.config, 1, config.sizes, config.encoder_input)
+        super().__init__(expert, replay, config, 1, seed, dataclasses.replace(sizes, mlp_dim=66))
+
+
+def distiller_of(case):
+    """What learns in a case of Figure 4 or 5; most differ from the default by settings alone."""
+    if case == "TAP":
+        from tap import TapDistiller
+        return TapDistiller
+    return {"MSE": MSEDistiller, "consistency": ConsistentDistiller,
+            "10% TD-MPC": SmallDistiller}.get(case, fac.Distiller)
+
+
+def distil(task, seed, case, settings):
+    """Distil a student; a row at each evaluation. settings: of DistillConfig, and `num_agents`,
+    `evaluations` on the way, of so many `episodes`, planned with `samples` and `iterations`."""
+    own = {k: settings.pop(k, v) for k, v in (("num_agents", None), ("evaluations", 1),
+                                              ("episodes", 10))}
+    budget = {k: settings.pop(k) for k in ("samples", "iterations") if k in settings}
+    config = fac.from_dict(fac.DistillConfig, settings, f"{task}, {case}")
+    expert, header = fac.load_model(fac.data_file(task, "expert.npz"))
+    distiller = distiller_of(case)(expert, fac.Replay(fac.data_file(task, "replay.npz")), config,
+                                   own["num_agents"], seed)
+    planning = fac.PlannerConfig(**{**fac.made_for(header, task), "horizon": config.horizon,
+                                    **budget})
+    playing = dataclasses.replace(planning, samples=64, iterations=3)
+    student, tap = distiller.student, case == "TAP"
+    environment = DecodingEnvironment(task, distiller.vae) if tap else None
+
+    def play_own(count):
+        seeds = fac.training_seeds(seed, "own episode", len(distiller.own) // fac.EPISODE_STEPS,
+                                   count)
+        return episodes(student, task, playing, seeds, environment)[0]
+
+    every = -(-config.steps // own["evaluations"])
+    with contextlib.closing(distiller):
+        for losses in distiller.run(play_own):
+            fac.check_finite({"loss is": losses}, distiller.t, config.lr)
+            if distiller.t % every and distiller.t < config.steps:
+                continue
+            seeds = fac.episode_seeds(0, own["episodes"])
+            row = summary(episodes(student, task, planning, seeds, environment)[1])
+            if not tap:  # whose actions are others
+                q, g = fac.rank_correlation(distiller, 256, planning.discount)
+                row.update(rank_q=float(q[0]), rank_return=float(g[-1]))
+            yield {"step": distiller.t, **row}
+
+
+class DecodingEnvironment(fac.Environment):
+    """A task for TAP's planner: its actions are latent ones."""
+
+    def __init__(self, task, vae):
+        super().__init__(task)
+        self._vae = vae
+
+    def step(self, action):
+        return super().step(self._vae.decode(action))
+
+
+FIGURE4 = {"Fac-TDMPC": {}, "100% TD-MPC": {"num_agents": 1}, "10% TD-MPC": {}, "TAP": {}}
+FIGURE5 = {  # panel: {case: settings}; every panel holds the default
+    "loss": {"default": {}, "MSE": {}},
+    "noise deviation": {"default": {}, **{f"noise {x}": {"noise_std": x, "noise_std_min": x}
+                                          for x in (0.1, 0.5, 2.0)}},
+    "student temperature": {"default": {}, **{f"T_s {x}": {"temperature_student": x}
+                                              for x in (0.1, 2.0)}},
+    "consistency": {"default": {}, "consistency": {}}}
+
+
+def command_figure4(args):
+    """figure4: the methods of B.2 by Algorithm 1."""
+    return run_all(args, distil, [make_run(task, seed, case, **budget(args), **settings)
+                                  for seed, task in itertools.product(args.seeds, args.tasks)
+                                  for case, settings in FIGURE4.items()])
+
+
+def command_figure5(args):
+    """figure5: the choices of the loss."""
+    cases = {case: settings for panel in FIGURE5.values() for case, settings in panel.items()}
+    return run_all(args, distil, [make_run(task, seed, case, **budget(args), **settings)
+                                  for seed, task in itertools.product(args.seeds, args.tasks)
+                                  for case, settings in cases.items()])
+
+
+def command_figure13(args):
+    """figure13: the number of agents."""
+    return run_all(args, distil, [make_run(task, seed, f"N = {n}", num_agents=n, **budget(args))
+                                  for seed, task in itertools.product(args.seeds, args.tasks)
+                                  for n in fac.divisors(fac.lookup_task(task)[3])])
+
+
+def budget(args):
+    """What the runs of a figure of distillation have in common."""
+    return {k: getattr(args, k) for k in ("steps", "evaluations", "episodes", "samples",
+                                          "iterations")}
+
+
+def command_sweep(args):
+    """sweep: a grid of distill's settings."""
+    known, grid = {f.name: f for f in dataclasses.fields(fac.DistillConfig)}, []
+    for text in args.set:
+        name, equals, values = text.partition("=")
+        name = name.replace("-", "_")
+        fac.need(equals and (name in known or name == "num_agents"), f"--set {text}: expected "
+                 f"SETTING=VALUE[,VALUE ...] with one of num_agents, {', '.join(known)}")
+        kind = type(known[name].default) if name in known else int
+        read = {bool: lambda x: {"true": True, "false": False}[x.lower()]}.get(kind, kind)
+        try:
+            grid.append([(name, read(value)) for value in values.split(",")])
+        except (ValueError, KeyError):
+            raise fac.UserError(f"--set {text}: expected {kind.__name__}s") from None
+    for settings in (points := [dict(point) for point in itertools.product(*grid)]):
+        fac.DistillConfig(**{k: v for k, v in settings.items() if k != "num_agents"})
+    return run_all(args, distil, [make_run(task, seed, "sweep", **{**budget(args), **settings})
+                                  for seed, task in itertools.product(args.seeds, args.tasks)
+                                  for settings in points])
+
+# ------------------------------------------------------------ Figures 7 and 8: planning
+
+BUDGETS = [(s, i) for s in (512, 256, 128, 64, 32, 16) for i in (6, 4, 2, 1)]
+KEEPS = 0.95  # of the full budget's return: what is still as good
+
+
+def load(task, seed, case, students):
+    """A task's expert (model, header), or the student that `distill` left in its folder."""
+    if case == "expert":
+        return fac.load_model(fac.data_file(task, "expert.npz"))
+    path = Path(students) / f"{task}-{seed}" / "student.npz"
+    fac.need(path.exists(), f"{path}: no such file; make it with 'python fac_tdmpc_ref.py distill "
+             f"--task {task} --seed {seed}', or name the folder above with --students")
+    return fac.load_model(path)
+
+
+def planning_runs(args, variants):
+    """A run for each variant (a dict) of planning with each model of each task."""
+    models = [("expert", 0), *(("student", seed) for seed in args.seeds)]
+    return [make_run(task, seed, case, students=args.students, episodes=args.episodes,
+                     weights=fac.checksum(load(task, seed, case, args.students)[0].params.values()),
+                     **variant)
+            for task in args.tasks for case, seed in models for variant in variants(task)]
+
+
+def planning_for(header, about):
+    """A model's own planning but for `samples` and `iterations`."""
+    budget = {k: about[k] for k in ("samples", "iterations") if k in about}
+    return fac.PlannerConfig(**fac.made_for(header, "model"), **budget)
+
+
+def plan_with(task, seed, case, settings):
+    """The returns of a model: with its file's planning but for `samples` and `iterations`, on a
+    robot that `joint` and `kind` disturb."""
+    model, header = load(task, seed, case, settings["students"])
+    planning = planning_for(header, settings)
+    environment = None
+    if settings.get("kind"):
+        environment = DisturbedEnvironment(task, settings["joint"], settings["kind"])
+    seeds = fac.episode_seeds(0, settings["episodes"])
+    yield summary(episodes(model, task, planning, seeds, environment)[1])
+
+
+class DisturbedEnvironment(fac.Environment):
+    """A task whose robot isn't the planner's: one action is noise, or its motor another."""
+
+    def __init__(self, task, joint, kind):
+        super().__init__(task)
+        self._joint = joint if kind == "noise" else None
+        self._rng = fac.stream(joint, "disturbance")
+        if self._joint is None:
+            self.env.physics.model.actuator_gear[joint] *= float(kind)
+
+    def step(self, action):
+        if self._joint is not None:
+            action = np.array(action)
+            action[self._joint] = np.clip(self._rng.standard_normal(), -1, 1)
+        return super().step(action)
+
+
+def command_figure7(args):
+    """figure7: samples and iterations; returns first, then milliseconds, nothing else running."""
+    runs = planning_runs(args, lambda task: [{"samples": s, "iterations": i} for s, i in BUDGETS])
+    result = run_all(args, plan_with, runs)
+    rows = read_rows(result["out"])
+    timed = {tuple(row[k] for k in KEY) for row in rows if row["ms"]}
+    for task in args.tasks:
+        todo = [run for run in runs if run["task"] == task and tuple(run.values()) not in timed]
+        if todo:
+            append_rows(Path(result["out"]), time_runs(task, todo, args.rounds))
     return result
 
 
-def print_benchmark(result, robots):
-    """Table 3, the speed-ups beside the paper's, and the decisions."""
-    times = {(r["robot"], r["function"], r["model"], r["mode"]):
-             f"{r['ms_mean']:.2f} ± {r['ms_std']:.2f}" for r in result["prediction"]}
-    ratio = {(r["robot"], r["function"], r["mode"]): r for r in result["speedup"]}
-    columns = [(m, "one-thread") for m in ("TD-MPC", "10% TD-MPC", "TAP", "Fac-TDMPC")]
-    columns += [("Fac-TDMPC", mode) for mode in MODES[1:]]
-    print(f"\nPrediction, ms, batch {TABLE3_BATCH}, mean ± sd; x: TD-MPC's time over Fac-TDMPC's, "
-          f"one thread / processes / one agent alone (paper: N threads)\n")
-    heads = [m if mode == "one-thread" else mode for m, mode in columns]
-    fac.print_table([("", "", *heads, "x", "paper's x")] + [
-        (robot, f, *(times[(robot, f, *column)] for column in columns),
-         " / ".join(f"{ratio[robot, f, mode]['value']:.1f}" for mode in MODES),
-         f"{ratio[robot, f, 'one-thread']['paper']:.1f}") for robot in robots for f in FUNCTIONS])
-    print("\nOne decision, ms, median (times the GEMM floor)\n")
-    rows = {}
-    for r in result["decision"]:
-        key = r["robot"], r["preset"], f"{r['samples']} x {r['iterations']}"
-        rows.setdefault(key, []).append((r["ms_median"], r["ratio_to_floor"]))
-    fac.print_table([("", "sizes", "budget", "TD-MPC", "Fac-TDMPC", *MODES[1:], "x")] + [
-        (*key, *(f"{ms:.2f} ({times_floor:.2f})" for ms, times_floor in cells),
-         " / ".join(f"{cells[0][0] / ms:.1f}" for ms, _ in cells[1:]))
-        for key, cells in rows.items()])
-    us = result["handover_us"]
-    print("\nno workers" if us is None else f"\na hand-over to the workers and back: {us:.0f} us",
-          f"{result['cores']} cores", sep="; ")
+def time_runs(task, runs, rounds):
+    """Rows with milliseconds of runs' decisions: in one process, and students' with a process on
+    each core. All take turns."""
+    models, calls = {}, []
+    with contextlib.ExitStack() as stack:
+        for run in runs:
+            about, key = json.loads(run["settings"]), (run["case"], run["seed"])
+            if key not in models:
+                models[key] = load(task, run["seed"], run["case"], about["students"])
+            model, header = models[key]
+            planning = planning_for(header, about)
+            obs = np.random.default_rng(0).standard_normal(model.config.dim_obs, fac.F32)
+            for workers in (0, fac.useful_workers(model.config.num_agents)):
+                planner = stack.enter_context(fac.Planner(model, planning, workers=workers))
+                calls.append(functools.partial(planner.act, obs))
+        ms = 1e3 * np.median(fac.interleaved_seconds(calls, rounds, f"{task}: timing"), 0)
+    return [{**run, "ms": float(alone), "ms_workers": float(parallel)}
+            for run, alone, parallel in zip(runs, ms[::2], ms[1::2])]
 
 
-def draw_prediction(path, prediction, robots):
-    """Figure 6: prediction times as bars, logarithmic."""
+def command_figure8(args):
+    """figure8: every action dimension in turn disturbed, which the planner doesn't know."""
+    def variants(task):
+        joints = range(fac.lookup_task(task)[3])
+        return [{}, *({"joint": j, "kind": kind} for j in joints
+                      for kind in ("noise", "0.5", "1.5"))]
+    return run_all(args, plan_with, planning_runs(args, variants))
+
+
+# ---------------------------------------------------------- Figure 12: distilling on the way
+
+def follow(task, seed, case, settings):
+    """train_expert.py --student fac: rows of the expert's and the student's returns."""
+    import train_expert
+    out = settings["out"]
+    status = train_expert.main(["--task", task, "--seed", str(seed), "--student", "fac", "--out",
+                                out, "--steps", str(settings["decisions"]), "--episodes", "0",
+                                "--evaluate-episodes", str(settings["episodes"]),
+                                "--workers", "1"])
+    fac.need(status == 0, f"train_expert.py --task {task} ended with status {status}")
+    with open(Path(out) / "curve.csv", newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            if row["eval_student"]:
+                yield {"step": row["decisions"], "return_mean": float(row["eval_student"]),
+                       "expert_mean": float(row["eval_expert"])}
+
+
+def command_figure12(args):
+    """figure12: online distillation (C.1)."""
+    return run_all(args, follow, [
+        make_run(task, seed, "online", decisions=args.decisions, episodes=args.episodes,
+                 out=f"runs/online-{task}-{seed}")
+        for seed, task in itertools.product(args.seeds, args.tasks)])
+
+# ------------------------------------------------------------------ report: tables, pictures
+
+# returns in the authors' logs, mean of 3 seeds, at 500k: 10% TD-MPC, TAP, 100% TD-MPC, Fac-TDMPC
+AUTHORS = {
+    "reacher-easy": (980, 977, 943, 978), "reacher-hard": (836, 874, 841, 746),
+    "hopper-hop": (309, 336, 341, 349), "fish-swim": (668, 169, 618, 529),
+    "cheetah-run": (916, 909, 915, 917), "walker-walk": (972, 845, 980, 967),
+    "walker-run": (697, 560, 836, 809), "quadruped-walk": (860, 464, 954, 942),
+    "quadruped-run": (916, 825, 863, 857), "humanoid-stand": (453, 468, 823, 735),
+    "humanoid-walk": (458, 227, 724, 789)}
+METHODS = ("10% TD-MPC", "TAP", "100% TD-MPC", "Fac-TDMPC")
+
+
+def curves(rows, column="return_mean"):
+    """{task: {case: {step: [value of each seed]}}} of finished runs."""
+    found = {}
+    for (task, _, case, _), own in rows.items():
+        for step, row in {float(r["step"]): r for r in own if r["step"]}.items():
+            found.setdefault(task, {}).setdefault(case, {}).setdefault(step, []).append(
+                float(row[column]))
+    return found
+
+
+def last(curve):
+    """Mean and deviation over seeds, and their number, where a curve ends."""
+    values = curve[max(curve)]
+    return {"mean": float(np.mean(values)), "std": float(np.std(values)), "seeds": len(values)}
+
+
+def draw_lines(path, panels, xlabel, **axes):
+    """A panel each {title: ({label: {x: [values]}}, level or None)}: mean and band over seeds;
+    the level, an expert's, is a line across."""
     plt = fac.pyplot()
-    subjects = list(dict.fromkeys((r["model"], r["mode"]) for r in prediction))
-    figure, axes = plt.subplots(3, 1, figsize=(10, 8), layout="constrained", sharex=True)
-    for ax, function in zip(axes, FUNCTIONS):
-        for i, (model, mode) in enumerate(subjects):
-            rows = [r for r in prediction if (r["function"], r["model"], r["mode"]) ==
-                    (function, model, mode)]
-            ax.bar(np.arange(len(robots)) + (i - 2.5) * 0.14, [r["ms_mean"] for r in rows], 0.13,
-                   yerr=[r["ms_std"] for r in rows], label=f"{model}, {mode}")
-        ax.set(yscale="log", ylabel=f"${function}$, ms")
-        ax.grid(axis="y", alpha=0.3)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
-    axes[-1].set_xticks(range(len(robots)), [f"{r}\nN = {ROBOTS[r][1]}" for r in robots])
+    columns = min(4, len(panels))
+    figure, grid = plt.subplots(-(-len(panels) // columns), columns, squeeze=False,
+                                figsize=(3.6 * columns, 3.2 * -(-len(panels) // columns)),
+                                layout="constrained")
+    for ax, (title, (lines, level)) in itertools.zip_longest(grid.flat, panels.items(),
+                                                             fillvalue=(None, (None, None))):
+        if lines is None:
+            ax.remove()
+            continue
+        for style, (label, points) in zip(styles(len(lines)), lines.items()):
+            x = sorted(points)
+            mean, std = (np.array([f(points[v]) for v in x]) for f in (np.mean, np.std))
+            ax.plot(x, mean, label=label, markersize=4, **style)
+            ax.fill_between(x, mean - std, mean + std, color=style["color"], alpha=0.15)
+        if level is not None:
+            ax.axhline(level, color="black", linewidth=0.8, linestyle=(0, (1, 3)), label="expert")
+        ax.set(title=title, xlabel=xlabel, ylabel="episode return", ylim=(0, None), **axes)
+        ax.grid(alpha=0.3)
+        ax.legend(fontsize=7)
     fac.save_figure(path, figure)
 
 
-# ------------------------------------------------------------------- section 5.6: watching
-
-PIXELS, BARS, TEXT = 240, 70, 34  # a picture's side, width of the bars beside, height of the text
-RENDERERS = "from dm_control import suite; suite.load('reacher', 'easy').physics.render(8, 8)"
-
-
-def choose_renderer():
-    """Set MUJOCO_GL to what draws off-screen here; UserError if nothing does."""
-    for backend in filter(None, (os.environ.get("MUJOCO_GL"), "egl", "osmesa")):
-        environment = {**os.environ, "MUJOCO_GL": backend}
-        if not subprocess.run([sys.executable, "-c", RENDERERS], env=environment,
-                              capture_output=True).returncode:
-            os.environ["MUJOCO_GL"] = backend
-            return
-    raise fac.UserError("MuJoCo can't draw off-screen here: install EGL (Debian: libegl1) or "
-                        "OSMesa (libosmesa6)")
+def expert_level(task):
+    """The mean of an expert's recorded returns, whichever setting they are of; None: no record."""
+    returns = list(fac.read_records(fac.DATA / task / "expert.npz").values())
+    return float(np.mean(returns[0])) if returns else None
 
 
-def shares(model, z, config):
-    """What each agent's own plan from z (N, m, 1) is worth to it above doing nothing, (N,)."""
-    n = model.config.num_agents
-    returns = functools.partial(fac.h_step_return, model, z, config=config)
-    nothing = np.zeros((n, config.horizon + 1, model.config.agent_actions), fac.F32)
-    plan, _, _ = fac.mppi(returns, nothing, config, [np.random.default_rng(0) for _ in range(n)])
-    worth = returns(np.stack([plan, nothing], -1))
-    return worth[:, 0] - worth[:, 1]
+def markdown(heads, rows):
+    """A Markdown table."""
+    return "\n".join("| " + " | ".join(map(str, row)) + " |" for row in (
+        heads, ["---"] * len(heads), *rows)) + "\n"
 
 
-def watch_episode(path, model, header, environment, seed, decisions, every):
-    """Frames of a model's episode: picture, shares (N,) and return so far of each; and its name
-    with the median milliseconds of a decision."""
-    config = fac.PlannerConfig(**fac.made_for(header, path))
-    frames, total, seconds = [], 0.0, []
-    with fac.Planner(model, config) as planner, fac.progress(f"playing {path}", decisions,
-                                                             "decision") as bar:
-        planner.reset(seed)
-        obs = environment.reset(seed)
-        for t in range(decisions):
-            if t % every == 0:
-                picture = environment.env.physics.render(PIXELS, PIXELS, camera_id=0)
-                frames.append((picture, shares(model, model.encode(obs[:, None]), config), total))
-            begin = time.perf_counter()
-            action = planner.act(obs)
-            seconds.append(time.perf_counter() - begin)
-            obs, reward = environment.step(action)
-            total += reward
-            bar.update()
-    name = f"{header['kind']}, N = {model.config.num_agents}"
-    return frames, name, 1e3 * float(np.median(seconds))
+def cell(found):
+    """mean ± deviation (seeds)."""
+    return f"{found['mean']:.0f} ± {found['std']:.0f} ({found['seeds']})" if found else "-"
 
 
-def draw_frames(episodes):
-    """PIL images of episodes side by side, each with bars for its agents' shares."""
-    from PIL import Image, ImageDraw
-    width, images = PIXELS + BARS, []
-    largest = [max(np.abs(share).max() for _, share, _ in frames) + 1e-9
-               for frames, *_ in episodes]
-    for columns in zip(*(frames for frames, *_ in episodes)):
-        image = Image.new("RGB", (width * len(episodes), PIXELS + TEXT), "white")
-        draw = ImageDraw.Draw(image)
-        for k, (picture, share, total) in enumerate(columns):
-            left, (_, name, ms) = k * width, episodes[k]
-            image.paste(Image.fromarray(picture), (left, 0))
-            height, middle = PIXELS / len(share), left + PIXELS + BARS / 2
-            for i, value in enumerate(share / largest[k] * (BARS / 2 - 4)):
-                draw.rectangle((min(middle, middle + value), (i + 0.15) * height,
-                                max(middle, middle + value), (i + 0.85) * height),
-                               fill="#1f77b4" if value > 0 else "#999999", outline="black")
-            draw.line((middle, 0, middle, PIXELS), fill="black")
-            draw.text((left + 4, PIXELS + 4), f"{name}: {ms:.1f} ms a decision", fill="black")
-            draw.text((left + 4, PIXELS + 18), f"return so far {total:.0f}", fill="black")
-        images.append(image)
-    return images
+def report_curves(name, rows, figures):
+    """Figures 4, 5, 12 and 13: curves; result {task: {case: last}} and Markdown."""
+    found = curves(rows)
+    if name == "figure12":
+        for task, cases in curves(rows, "expert_mean").items():
+            found[task] = {"student": found[task]["online"], "expert": cases["online"]}
+    if name == "figure5":
+        panels = {f"{task}: {panel}": ({case: cases[case] for case in own if case in cases},
+                                       expert_level(task))
+                  for task, cases in found.items() for panel, own in FIGURE5.items()}
+    else:
+        panels = {task: (cases, None if name == "figure12" else expert_level(task))
+                  for task, cases in found.items()}
+    draw_lines(figures / f"{name}.png", panels,
+               "decisions" if name == "figure12" else "gradient step")
+    result = {task: {case: last(curve) for case, curve in cases.items()}
+              for task, cases in found.items()}
+    cases = list(dict.fromkeys(case for found in result.values() for case in found))
+    if name == "figure4":
+        cases = [case for case in METHODS if case in cases]
+    table = [(task, *(cell(found.get(case)) for case in cases),
+              *([" / ".join(map(str, AUTHORS[task]))] if name == "figure4" else []))
+             for task, found in result.items()]
+    heads = ["", *cases] + (["authors: " + " / ".join(METHODS)] if name == "figure4" else [])
+    return result, markdown(heads, table)
 
 
-def command_watch(args):
-    """watch: an episode as a moving picture."""
-    fac.need(Path(args.out).suffix == ".gif", f"{args.out}: expected a name that ends in .gif")
-    fac.pyplot()  # brings Pillow
-    models = [(path, *fac.load_model(path)) for path in (args.model, args.beside) if path]
-    task = args.task or models[0][2].get("task")
-    for _, model, _ in models:
-        fac.check_task(model.config, task)
-    choose_renderer()
-    environment = fac.Environment(task)
-    seed = fac.episode_seeds(args.seed, args.episode + 1)[args.episode]
-    episodes = [watch_episode(*found, environment, seed, args.decisions, args.every)
-                for found in models]
-    images = [image.quantize(64) for image in draw_frames(episodes)]
-    seconds = fac.ACTION_REPEAT * environment.env.control_timestep() * args.every
-    with fac.atomic_file(args.out) as file:
-        images[0].save(file, format="gif", save_all=True, append_images=images[1:], loop=0,
-                       duration=max(20, int(1e3 * seconds)))
-    result = {"out": args.out, "frames": len(images), "bytes": Path(args.out).stat().st_size,
-              "ms": [ms for *_, ms in episodes], "returns": [f[-1][2] for f, *_ in episodes]}
-    print(f"{args.out}: {result['frames']} frames, {result['bytes'] / 1e6:.1f} MB")
+def report_figure7(_, rows, figures):
+    """Figure 7: the smallest budget, by milliseconds, that keeps 0.95 of the full one's return."""
+    cells = {}
+    for (task, _, case, settings), own in rows.items():
+        about = json.loads(settings)
+        into = cells.setdefault(task, {}).setdefault(case, {}).setdefault(
+            (about["samples"], about["iterations"]), {"return": [], "ms": [], "ms_workers": []})
+        for row in own:
+            for key in into:
+                value = row["return_mean" if key == "return" else key]
+                into[key] += [float(value)] if value else []
+    panels, result, table = {}, [], []
+    for task, cases in cells.items():
+        for axis, other, name in ((0, 6, "samples"), (1, 512, "iterations")):
+            panels[f"{task}: {name} ({other} {('iterations', 'samples')[axis]})"] = ({
+                case: {budget[axis]: about["return"] for budget, about in budgets.items()
+                       if budget[1 - axis] == other} for case, budgets in cases.items()}, None)
+        least = {}
+        for case, budgets in cases.items():
+            full = np.mean(budgets.get((512, 6), {"return": [np.nan]})["return"])
+            good = {budget: about for budget, about in budgets.items() if about["ms"]
+                    and np.mean(about["return"]) >= KEEPS * full}
+            for key in ("ms", "ms_workers") if case == "student" else ("ms",):
+                best = min(good, key=lambda b: np.mean(good[b][key]), default=None)  # noqa: B023
+                if best:
+                    least[case, key] = {"samples": best[0], "iterations": best[1],
+                                        "ms": float(np.mean(good[best][key]))}
+        if len(least) == 3:
+            expert, alone, parallel = (least[k] for k in (("expert", "ms"), ("student", "ms"),
+                                                          ("student", "ms_workers")))
+            row = {"task": task, "expert": expert, "student": min(
+                alone, parallel, key=lambda x: x["ms"]), "student_in_process": alone,
+                "student_workers": parallel}
+            row["ratio"] = expert["ms"] / row["student"]["ms"]
+            row["ratio_in_process"] = expert["ms"] / alone["ms"]
+            result.append(row)
+            table.append((task, *(f"{x['samples']} x {x['iterations']}: {x['ms']:.1f} ms"
+                                  for x in (expert, alone, parallel)), f"{row['ratio']:.1f}"))
+    draw_lines(figures / "figure7.png", panels, "samples or iterations", xscale="log")
+    return result, markdown(("", "expert", "student, one process", "student, workers", "ratio"),
+                            table)
+
+
+def report_figure8(_, rows, figures):
+    """Figure 8: bars of the return with each action dimension disturbed; means over these."""
+    cells = {}
+    for (task, _, case, settings), own in rows.items():
+        about = json.loads(settings)
+        cells.setdefault(task, {}).setdefault(case, {}).setdefault(
+            (about.get("kind", "none"), about.get("joint", 0)), []).append(
+            float(own[-1]["return_mean"]))
+    plt, kinds = fac.pyplot(), ("noise", "0.5", "1.5")
+    figure, grid = plt.subplots(len(cells), 3, squeeze=False, layout="constrained",
+                                figsize=(11, 2.6 * len(cells)), sharey="row")
+    result, table = {}, []
+    for row, (task, cases) in zip(grid, cells.items()):
+        for ax, kind in zip(row, kinds):
+            for i, (case, values) in enumerate(sorted(cases.items())):
+                joints = sorted(j for k, j in values if k == kind)
+                ax.bar(np.arange(len(joints)) + 0.4 * i - 0.2,
+                       [np.mean(values[kind, j]) for j in joints], 0.38, label=case,
+                       color=STYLES[i]["color"], hatch=("", "//")[i % 2], edgecolor="black")
+                if ("none", 0) in values:
+                    ax.axhline(np.mean(values["none", 0]), color=STYLES[i]["color"],
+                               linestyle=STYLES[i]["linestyle"], linewidth=1)
+            what = "one action is noise" if kind == "noise" else f"one motor x {kind}"
+            ax.set(title=f"{task}: {what}", xlabel="action dimension", ylabel="episode return")
+        row[0].legend(fontsize=7)
+        result[task] = {case: {kind: float(np.mean([np.mean(v) for (k, _), v in values.items()
+                                                    if k == kind] or [np.nan]))
+                               for kind in ("none", *kinds)} for case, values in cases.items()}
+        table += [(task, case, *(f"{x:.0f}" for x in found.values()))
+                  for case, found in sorted(result[task].items())]
+    fac.save_figure(figures / "figure8.png", figure)
+    return result, markdown(("", "", "undisturbed", *kinds), table)
+
+
+REPORT_HEAD = """# The paper's figures, here
+
+Written by `python data/experiments.py report` from the CSVs beside it; README.md says what they
+show. Returns: mean ± deviation over seeds (their number); every run's settings are in its CSV.
+
+"""
+REPORTS = {"figure4": report_curves, "figure5": report_curves, "figure7": report_figure7,
+           "figure8": report_figure8, "figure12": report_curves, "figure13": report_curves}
+
+
+def command_report(args):
+    """report: every figure that has runs."""
+    results, figures, result, text = Path(args.results), Path(args.figures), {}, []
+    figures_from = os.path.relpath(figures, results)
+    fac.pyplot()
+    for name, make in REPORTS.items():
+        rows = finished(read_rows(results / f"{name}.csv"))
+        if rows:
+            result[name], table = make(name, rows, figures)
+            text.append(f"## Figure {name[6:]}\n\n{table}\n![]({figures_from}/{name}.png)\n")
+    fac.need(result, f"{results}: no runs there; make some, e.g. 'python data/experiments.py "
+             f"figure4'")
+    with fac.atomic_file(results / "report.md", "w", encoding="utf-8") as file:
+        file.write(REPORT_HEAD + "\n".join(text))
+    print("\n".join(text) + f"\n{results / 'report.md'}, {figures}/")
     return result
 
 
@@ -377,6 +672,7 @@ def make_parser():
     parser = fac.Parser(prog="experiments.py", description="The paper's tables and figures, each "
                         "by one command.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="EXPERIMENT")
+    positive = functools.partial(fac.natural, least=1)
     sub = fac.add_command(
         commands, "table3", command_table3, "Planning speed: Table 3 (the networks) and whole "
         "decisions, centralized and factored, by threads and processes.",
@@ -390,6 +686,60 @@ def make_parser():
                      "tenth as often [100]")
     sub.add_argument("--figure", help="draw Figure 6 into this file")
     fac.add_config(sub, fac.PlannerConfig, **fac.paper_preset(fac.PlannerConfig))
+    def add_runs(name, run, help, tasks, **defaults):
+        sub = fac.add_command(commands, name, run, help, epilog="The same command again makes "
+                              "the runs that are missing in the CSV, and only these.")
+        sub.add_argument("--tasks", nargs="+", default=tasks, metavar="TASK",
+                         help="[" + " ".join(tasks) + "]")
+        sub.add_argument("--seeds", nargs="+", type=fac.natural, default=[0, 1, 2],
+                         metavar="SEED", help="[0 1 2]")
+        sub.add_argument("--jobs", type=positive, default=fac.cores(),
+                         help="runs at a time [one for each core]")
+        sub.add_argument("--out", help=f"the CSV [data/results/{name}.csv]")
+        sub.add_argument("--episodes", type=positive, default=defaults.get("episodes", 10),
+                         help="evaluation episodes of a run [%(default)s]")
+        if "steps" in defaults:
+            sub.add_argument("--steps", type=positive, default=defaults["steps"],
+                             help="gradient steps [%(default)s; paper: 100000]")
+            sub.add_argument("--evaluations", type=positive, default=defaults["evaluations"],
+                             help="of a run, evenly over its steps [%(default)s]")
+            for name in ("samples", "iterations"):
+                sub.add_argument(f"--{name}", type=positive, help="MPPI's, in evaluations "
+                                 f"[{getattr(fac.PlannerConfig, name)}]")
+        return sub
+
+    walkers, steps = ["walker-walk", "walker-run"], fac.DistillConfig.steps
+    shipped = sorted(path.parent.name for path in fac.DATA.glob("*/expert.npz"))
+    add_runs("figure4", command_figure4, "Section 5.2: Fac-TDMPC, 100% and 10% TD-MPC and TAP, "
+             "by Algorithm 1; return against steps.", shipped, steps=steps, evaluations=4)
+    add_runs("figure5", command_figure5, "Section 5.3: KL against MSE, the perturbations' "
+             "deviation, the student's temperature, a consistency loss.", walkers, steps=steps,
+             evaluations=4)
+    for name, run, help in (
+            ("figure7", command_figure7, "Section 5.4: samples and iterations, expert and student: "
+             "returns, then milliseconds (keep the machine quiet for these)."),
+            ("figure8", command_figure8, "Section 5.5: one action dimension is noise, or its motor "
+             "half or one and a half times as strong.")):
+        sub = add_runs(name, run, help, walkers)
+        sub.add_argument("--students", default="runs", help="where distill left TASK-SEED/ [runs]")
+    commands.choices["figure7"].add_argument("--rounds", type=positive, default=20,
+                                             help="timings of each [20]")
+    sub = add_runs("figure12", command_figure12, "Appendix C.1: an expert that learns and a "
+                   "student that follows it.", ["reacher-easy", "walker-walk", "cheetah-run"])
+    sub.add_argument("--decisions", type=positive, default=30_000, help="of training [30000]")
+    add_runs("figure13", command_figure13, "Appendix C.2: the number of agents.", walkers,
+             steps=steps, evaluations=4)
+    sub = add_runs("sweep", command_sweep, "A grid over any settings of distill.",
+                   ["reacher-hard"], steps=steps, evaluations=1)
+    sub.add_argument("--set", nargs="+", required=True, metavar="SETTING=VALUE,...",
+                     help="e.g. lr=1e-3,3e-4 batch-size=16,32; see distill --help")
+    sub.add_argument("--backend", choices=("dask", "ray"), help="run on a cluster, whose workers "
+                     "find data/ on their PYTHONPATH [processes of this machine]")
+    sub.add_argument("--scheduler", help="dask: tcp://HOST:PORT; ray: an address [its own]")
+    sub = fac.add_command(commands, "report", command_report, "Tables and figures from the CSVs: "
+                          "data/results/report.md, data/figures/figure*.png.")
+    sub.add_argument("--results", default=RESULTS, help="where the CSVs are [data/results]")
+    sub.add_argument("--figures", default=fac.DATA / "figures", help="[data/figures]")
     sub = fac.add_command(
         commands, "watch", command_watch, "An episode as a moving picture: beside the robot a bar "
         "for each agent, what its plan is worth above doing nothing; below, a decision's time.")
@@ -398,11 +748,28 @@ def make_parser():
     sub.add_argument("--task", help="one of: " + ", ".join(fac.TASKS) + " [the model's own]")
     sub.add_argument("--seed", type=fac.natural, default=0, help="of the evaluation [0]")
     sub.add_argument("--episode", type=fac.natural, default=0, help="of that evaluation [0]")
-    sub.add_argument("--decisions", type=functools.partial(fac.natural, least=1), default=150,
+    sub.add_argument("--decisions", type=positive, default=150,
                      help="[150]")
-    sub.add_argument("--every", type=functools.partial(fac.natural, least=1), default=2,
+    sub.add_argument("--every", type=positive, default=2,
                      help="decisions between two frames [2]")
     sub.add_argument("--out", required=True, help="a .gif file")
+    for name, run, help, episodes in (
+            ("figure9", command_figure9, "Section 5.6: latents by joint (t-SNE, PCA), and each "
+             "joint's return in the best and the worst episode.", 100),
+            ("agreement", command_agreement, "Rank correlation of each joint's share with the "
+             "expert's Q when that joint alone moves: in held-out states, and through the "
+             "student's worst episode.", 20)):
+        sub = fac.add_command(commands, name, run, help)
+        sub.add_argument("--model", required=True, help="a student.npz")
+        sub.add_argument("--task", help="one of: " + ", ".join(fac.TASKS) + " [the model's own]")
+        sub.add_argument("--seed", type=fac.natural, default=0, help="of the episodes [0]")
+        sub.add_argument("--episodes", type=positive, default=episodes, help="[%(default)s]")
+        sub.add_argument("--out", default=f"{name}.png", help="the picture [%(default)s]")
+    sub.add_argument("--expert", help="the expert's file [data/TASK/expert.npz]")
+    sub.add_argument("--replay", help="its replay [data/TASK/replay.npz]")
+    sub.add_argument("--states", type=positive, default=256, help="held-out ones [%(default)s]")
+    commands.choices["figure9"].add_argument("--points", type=positive, default=500,
+                                             help="states that are drawn [%(default)s]")
     return parser
 
 

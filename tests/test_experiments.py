@@ -1,13 +1,21 @@
 """data/experiments.py: the paper's tables as users run them, small."""
+import dataclasses
 import importlib.util
 import os
+import signal
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
 
 import experiments
 import fac_tdmpc_ref as fac
-from test_cli import BLOCKED, ONE_THREAD, ROOT, last_json, launch
+import look
+import speed
+import tap
+from test_cli import BLOCKED, ONE_THREAD, ROOT, last_json, launch, write_expert
 from test_planning import random_model
 
 
@@ -25,7 +33,7 @@ def refused(done, *parts):
 
 @pytest.mark.parametrize("flags, parts", [
     ([], ["EXPERIMENT"]),
-    (["table3", "--robots", "reecher"], ["'reecher'", *experiments.ROBOTS]),
+    (["table3", "--robots", "reecher"], ["'reecher'", *speed.ROBOTS]),
     (["table3", "--runs", "9"], ["runs", "at least 10"]),
     (["table3", "--workers", "-1"], ["--workers", "-1"]),
     (["table3", "--elites", "600"], ["samples (512)", "not 600"])])
@@ -90,8 +98,288 @@ def test_multiply_adds_count_the_weights_of_equation_2():
                        and k.endswith("weight") and v.shape[2] > 1)
              for name in ("_dynamics", "_reward", "_Q")}
     config = fac.PlannerConfig(samples=7, iterations=2, horizon=3)
-    assert experiments.multiply_adds(model.config, config) == 7 * 2 * (
+    assert speed.multiply_adds(model.config, config) == 7 * 2 * (
         3 * (sizes["_dynamics"] + sizes["_reward"]) + sizes["_Q"])
+
+
+# runs ---------------------------------------------------------------------------------
+
+SMALL = ["--tasks", "cheetah-run", "--seeds", "0", "--steps", "4", "--episodes", "1", "--samples",
+         "8", "--iterations", "1", "--out", "sweep.csv"]
+SET = ["own-episodes=0", "batch-size=2"]
+
+
+def rows_of(path):
+    """{settings: rows} of a CSV's finished runs, without what the clock says."""
+    return {key[3]: [{k: v for k, v in row.items() if k != "minutes"} for row in rows]
+            for key, rows in experiments.finished(experiments.read_rows(path)).items()}
+
+
+def test_a_killed_sweep_goes_on_and_makes_no_run_twice(tmp_path):
+    pytest.importorskip("joblib")
+    flags = ["sweep", *SMALL, "--set", *SET, "lr=1e-3,2e-3,3e-3", "--jobs", "1"]
+    process = subprocess.Popen(
+        [sys.executable, ROOT / "data" / "experiments.py", *flags], cwd=tmp_path,
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    path, begun = tmp_path / "sweep.csv", time.time()
+    while not path.exists() and time.time() - begun < 100:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    before = rows_of(path)
+    assert 1 <= len(before) < 3
+    with open(path, "a") as file:
+        file.write('cheetah-run,0,sweep,"{""batch')  # a line that a kill cut off
+    result = last_json(run(*flags, "--json", cwd=tmp_path))
+    assert result == {"out": "sweep.csv", "runs": 3, "now": 3 - len(before), "failed": 0}
+    after = rows_of(path)
+    assert len(after) == 3 and all(len(rows) == 1 for rows in after.values())
+    assert {k: after[k] for k in before} == before
+    result = last_json(run(*flags, "--json", cwd=tmp_path))
+    assert result["now"] == 0 and rows_of(path) == after
+
+
+def test_a_failed_run_is_a_row_and_is_tried_again(tmp_path):
+    pytest.importorskip("joblib")
+    flags = ["sweep", *SMALL, "--set", *SET, "num-agents=4,6"]
+    for _ in range(2):
+        done = run(*flags, "--json", cwd=tmp_path)
+        assert last_json(done)["failed"] == 1 and "num_agents" in done.stderr
+    rows = experiments.read_rows(tmp_path / "sweep.csv")
+    assert ["num_agents" in row["error"] for row in rows].count(True) == 2
+    assert len(rows) == 3 and len(rows_of(tmp_path / "sweep.csv")) == 1
+
+
+def test_dask_gives_the_rows_that_processes_give(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    pytest.importorskip("joblib")
+    flags = ["sweep", *SMALL, "--set", *SET, "num-agents=3,6"]
+    last_json(run(*flags, "--json", cwd=tmp_path))
+    here = rows_of(tmp_path / "sweep.csv")
+    os.environ["PYTHONPATH"] = str(ROOT / "data")
+    try:
+        with distributed.LocalCluster(n_workers=1, threads_per_worker=1,
+                                      dashboard_address=None) as cluster:
+            last_json(run(*flags, "--out", "dask.csv", "--backend", "dask", "--scheduler",
+                          cluster.scheduler_address, "--json", cwd=tmp_path))
+    finally:
+        del os.environ["PYTHONPATH"]
+    assert rows_of(tmp_path / "dask.csv") == here and len(here) == 2
+
+
+@pytest.mark.parametrize("flags, parts", [
+    (["sweep"], ["--set"]),
+    (["sweep", "--set", "depth=3"], ["depth=3", "noise_samples"]),
+    (["sweep", "--set", "lr=fast"], ["lr=fast", "float"]),
+    (["sweep", "--set", "kl=sideways"], ["kl", "sideways"]),
+    (["sweep", "--set", "lr=1e-3", "--backend", "dask"], ["--scheduler"]),
+    (["figure4", "--tasks", "reecher-hard"], ["reecher-hard", "reacher-hard"]),
+    (["figure5", "--jobs", "0"], ["--jobs"]),
+    (["figure7", "--tasks", "walker-run", "--seeds", "7"], ["walker-run-7", "distill"]),
+    (["report", "--results", "."], ["no runs"])])
+def test_bad_runs_are_refused(tmp_path, flags, parts):
+    pytest.importorskip("joblib")
+    pytest.importorskip("matplotlib")
+    refused(run(*flags, cwd=tmp_path), *parts)
+
+
+def test_rows_of_another_kind_are_refused(tmp_path):
+    (tmp_path / "x.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(fac.UserError, match="expected the columns task,seed"):
+        experiments.read_rows(tmp_path / "x.csv")
+
+
+def test_every_method_of_figure_4_learns_and_plans():
+    """Rows at each evaluation; 10% TD-MPC has few weights; TAP plans latent actions."""
+    weights = {}
+    for case, settings in experiments.FIGURE4.items():
+        kind = experiments.distiller_of(case)
+        expert, _ = fac.load_model(fac.data_file("cheetah-run", "expert.npz"))
+        replay = fac.Replay(fac.data_file("cheetah-run", "replay.npz"))
+        config = fac.DistillConfig(steps=2, batch_size=2, own_episodes=0)
+        distiller = kind(expert, replay, config, settings.get("num_agents"), 0)
+        assert len(list(distiller.run())) == 2
+        distiller.close()
+        weights[case] = sum(v.size for k, v in distiller.student.params.items()
+                            if k.startswith(("_dynamics", "_reward", "_Q")))
+        rows = list(experiments.distil("cheetah-run", 0, case, {
+            **settings, "steps": 4, "evaluations": 2, "episodes": 1, "samples": 4,
+            "iterations": 1, "own_episodes": 0, "batch_size": 2}))
+        assert [row["step"] for row in rows] == [2, 4] and rows[-1]["return_mean"] >= 0
+    assert 0.02 < weights["10% TD-MPC"] / weights["100% TD-MPC"] < 0.04
+
+
+def loss_inputs(dtype=np.float64):
+    """A small student, features, actions, targets and the expert's latents."""
+    rng = np.random.default_rng(0)
+    sizes = dataclasses.replace(fac.ModelConfig(5, 2, 2, 3, 6, 7), expert_latent_dim=4,
+                                expert_enc_dim=6)
+    student = fac.WorldModel.create(sizes, rng, dtype=dtype)
+    for value in student.params.values():
+        value += 0.1 * rng.standard_normal(value.shape)
+    targets = [rng.standard_normal((3, 4, 3)) for _ in range(3)]
+    return (student, rng.standard_normal((1, 4, 4)), rng.uniform(-1, 1, (3, 2, 4, 3)),
+            [*targets, rng.standard_normal((3, 4, 3, 4))])
+
+
+def slopes(loss, params, grads):
+    """(central difference, gradient) of a few entries of every parameter."""
+    rng = np.random.default_rng(1)
+    for key in grads:
+        for _ in range(3):
+            i = tuple(rng.integers(n) for n in params[key].shape)
+            old = params[key][i]
+            values = []
+            for step in (1e-6, -1e-6):
+                params[key][i] = old + step
+                values.append(loss())
+            params[key][i] = old
+            yield (values[0] - values[1]) / 2e-6, grads[key][i]
+
+
+@pytest.mark.parametrize("kind", [experiments.MSEDistiller, experiments.ConsistentDistiller])
+def test_gradients_of_the_other_losses(kind, monkeypatch):
+    student, features, actions, targets = loss_inputs()
+    config = fac.DistillConfig(horizon=2, lam=0.7)
+    targets = targets[:3] if kind is experiments.MSEDistiller else targets
+    grads = {k: np.zeros_like(v) for k, v in student.params.items() if k[:7] != "_expert"}
+    kind.loss(student, features, actions, targets, config, grads)
+    encode = student.encode_features  # the goals, of 3 * 4 * 3 columns, are held fixed
+    goal = targets[-1].reshape(1, -1, 4).swapaxes(1, 2) if len(targets) == 4 else None
+    fixed = goal is not None and encode(goal)
+    monkeypatch.setattr(student, "encode_features", lambda x, tape=None: fixed
+                        if x.shape[-1] == 36 else encode(x, tape))
+    for numeric, exact in slopes(lambda: kind.loss(student, features, actions, targets, config)[0],
+                                 student.params, grads):
+        np.testing.assert_allclose(exact, numeric, rtol=1e-5, atol=1e-8)
+
+
+def test_consistency_vanishes_where_the_student_follows_the_expert():
+    """What it adds is the mean square of s_{h+1} - f_E(expert's s_{h+1}), by hand."""
+    student, features, actions, targets = loss_inputs()
+    config = fac.DistillConfig(horizon=2, lam=0.5)
+    base = fac.distill_loss(student, features, actions, targets[:3], config)[0]
+    found = experiments.consistency_loss(student, features, actions, targets, config)[0]
+    z, expected = np.repeat(student.encode_features(features), 3, 2), 0.0
+    for h in range(3):
+        a = actions[h].reshape(2, 1, 12)
+        z = student.next(z, a)
+        goal = student.encode_features(targets[3][h].reshape(1, 12, 4).swapaxes(1, 2))
+        expected += 2.0 * 0.5 ** h * ((z - goal) ** 2).mean()
+    assert np.isclose(found - base, expected)
+
+
+def small_vae(dtype=np.float64):
+    return tap.ActionVAE(3, np.random.default_rng(0), 8, dtype)
+
+
+def test_gradients_of_the_action_vae():
+    vae, rng = small_vae(), np.random.default_rng(2)
+    actions, noise = rng.uniform(-1, 1, (3, 5)), rng.standard_normal((2, 5))
+    grads = {k: np.zeros_like(v) for k, v in vae.params.items()}
+    vae.loss(actions, noise, 0.3, grads)
+    for numeric, exact in slopes(lambda: vae.loss(actions, noise, 0.3), vae.params, grads):
+        np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-9)
+
+
+def test_the_action_vae_against_pytorch():
+    torch = pytest.importorskip("torch")
+    from torch_learner import network
+    vae, rng = small_vae(), np.random.default_rng(2)
+    actions, noise = rng.uniform(-1, 1, (3, 5)), rng.standard_normal((2, 5))
+    grads = {k: np.zeros_like(v) for k, v in vae.params.items()}
+    loss = vae.loss(actions, noise, 0.3, grads)
+    params = {k: torch.tensor(v, requires_grad=True) for k, v in vae.params.items()}
+    a = torch.tensor(actions.T)
+    mu, log_var = network(fac.MLP, params, "encode", a[None])[0].chunk(2, -1)
+    posterior = torch.distributions.Normal(mu, (log_var / 2).exp())
+    prior = torch.distributions.Normal(torch.zeros(()), torch.ones(()))
+    u = mu + posterior.stddev * torch.tensor(noise.T)
+    error = (network(fac.MLP, params, "decode", u[None])[0] - a).square().sum()
+    total = (error + 0.3 * torch.distributions.kl_divergence(posterior, prior).sum()) / 5
+    total.backward()
+    assert np.isclose(loss, total.item())
+    for key, p in params.items():
+        np.testing.assert_allclose(grads[key], p.grad, rtol=1e-9, atol=1e-12)
+
+
+def test_the_action_vae_finds_a_plane():
+    """Actions of a plane in four dimensions come back; latent ones stay in [-1, 1]."""
+    rng = np.random.default_rng(0)
+    plane = rng.standard_normal((4, 2)) / 3
+
+    def draw(batch):
+        return (plane @ rng.uniform(-1, 1, (2, batch))).astype(np.float32)
+
+    vae = tap.ActionVAE(4, rng)
+    vae.fit(draw, rng, 600, beta=1e-3)
+    actions = draw(64)
+    u = vae.encode(actions)
+    assert u.shape == (2, 64) and np.abs(u).max() <= 1
+    back = np.stack([vae.decode(x) for x in u.T], 1)
+    assert ((back - actions) ** 2).mean() < 0.05 * actions.var()
+
+
+def test_a_disturbed_robot():
+    def step(kind, action, joint=0):
+        environment = experiments.DisturbedEnvironment("walker-walk", joint, kind)
+        environment.reset(0)
+        return environment.step(np.array(action, np.float32))[0]
+
+    plain = fac.Environment("walker-walk")
+    plain.reset(0)
+    full, half = np.eye(6)[0], np.eye(6)[0] / 2
+    expected = plain.step(half)[0]
+    np.testing.assert_allclose(step("0.5", full), expected, atol=1e-6)  # half a motor, whole action
+    assert not np.allclose(step("1.5", full), step("0.5", full))
+    assert not np.allclose(step("noise", full), step("1.5", 0 * full))
+    np.testing.assert_array_equal(step("noise", full), step("noise", 0 * full))  # unheard
+
+
+def write_rows(path, runs):
+    """A CSV of runs: (task, seed, case, settings, [row, ...])."""
+    for task, seed, case, settings, rows in runs:
+        run = experiments.make_run(task, seed, case, **settings)
+        experiments.append_rows(path, [{**run, **row} for row in rows])
+
+
+def test_report_draws_what_the_csvs_hold(tmp_path):
+    pytest.importorskip("matplotlib")
+    for name, cases in (("figure4", experiments.FIGURE4), ("figure5", {"default": {}, "MSE": {}}),
+                        ("figure13", {"N = 1": {}})):
+        write_rows(tmp_path / f"{name}.csv", [
+            ("walker-run", seed, case, {}, [{"step": 5, "return_mean": 1.0},
+                                            {"step": 10, "return_mean": 10.0 + seed,
+                                             "minutes": 1.0}])
+            for case in cases for seed in (0, 2)] + [
+            ("walker-run", 1, "TAP", {}, [{"error": "no"}])])
+    write_rows(tmp_path / "figure12.csv", [("walker-walk", 0, "online", {}, [
+        {"step": 4, "return_mean": 5.0, "expert_mean": 6.0, "minutes": 1.0}])])
+    write_rows(tmp_path / "figure8.csv", [("walker-run", 0, case, about, [
+        {"return_mean": value, "minutes": 1.0}]) for case in ("expert", "student")
+        for about, value in (({}, 9.0), *(({"joint": j, "kind": kind}, 4.0 + 2 * j)
+                                          for j in (0, 1) for kind in ("noise", "0.5", "1.5")))])
+    write_rows(tmp_path / "figure7.csv", [("walker-run", 0, case, {"samples": s, "iterations": i}, [
+        {"return_mean": value, "minutes": 1.0}, {"ms": ms, "ms_workers": ms / 2}])
+        for case in ("expert", "student")
+        for s, i, value, ms in ((512, 6, 100.0, 80.0), (64, 6, 96.0, 12.0), (64, 2, 94.0, 6.0),
+                                (16, 6, 97.0 * (case == "student"), 4.0))])
+    found = last_json(run("report", "--results", ".", "--figures", "pictures", "--json",
+                          cwd=tmp_path))
+    last = {"mean": 11.0, "std": 1.0, "seeds": 2}
+    assert found["figure4"]["walker-run"] == dict.fromkeys(experiments.FIGURE4, last)
+    assert found["figure5"]["walker-run"] == {"default": last, "MSE": last}
+    assert found["figure12"]["walker-walk"]["expert"]["mean"] == 6.0
+    assert found["figure8"]["walker-run"]["student"] == {"none": 9.0, "noise": 5.0, "0.5": 5.0,
+                                                         "1.5": 5.0}
+    (row,) = found["figure7"]
+    assert row["task"] == "walker-run" and row["ratio"] == 6.0 and row["ratio_in_process"] == 3.0
+    assert row["expert"] == {"samples": 64, "iterations": 6, "ms": 12.0}
+    assert row["student"] == {"samples": 16, "iterations": 6, "ms": 2.0}
+    assert sorted(os.listdir(tmp_path / "pictures")) == sorted(f"{k}.png" for k in found)
+    text = (tmp_path / "report.md").read_text(encoding="utf-8")
+    for part in ("## Figure 13", "697 / 560 / 836 / 809", "11 ± 1 (2)", "pictures/figure7.png"):
+        assert part in text
 
 
 # watch --------------------------------------------------------------------------------
@@ -101,22 +389,22 @@ def test_shares_are_each_agent_s_own():
     """An agent alone plans and gains the same (Proposition 1), and more than nothing."""
     model, config = random_model(), fac.PlannerConfig(samples=64, horizon=2)
     z = model.encode(np.random.default_rng(0).standard_normal((8, 1), np.float32))
-    found = experiments.shares(model, z, config)
-    alone = [experiments.shares(model.agents(i, i + 1), z[i:i + 1], config)[0] for i in range(3)]
+    found = look.shares(model, z, config)
+    alone = [look.shares(model.agents(i, i + 1), z[i:i + 1], config)[0] for i in range(3)]
     assert found.shape == (3,) and (found > 0).all()
     np.testing.assert_allclose(found, alone, rtol=1e-4)
 
 
 def test_frames_hold_pictures_and_bars():
     pytest.importorskip("PIL")
-    size, shares = experiments.PIXELS, np.array([1.0, -0.5])
+    size, shares = look.PIXELS, np.array([1.0, -0.5])
     frames = [(np.full((size, size, 3), 7, np.uint8), shares, 3.0)] * 4
-    images = experiments.draw_frames([(frames, "expert, N = 2", 1.0), (frames, "student", 2.0)])
-    width = size + experiments.BARS
-    assert len(images) == 4 and images[0].size == (2 * width, size + experiments.TEXT)
+    images = look.draw_frames([(frames, "expert, N = 2", 1.0), (frames, "student", 2.0)])
+    width = size + look.BARS
+    assert len(images) == 4 and images[0].size == (2 * width, size + look.TEXT)
     for left in (0, width):
         assert images[0].getpixel((left + 5, 5)) == (7, 7, 7)
-        middle = left + size + experiments.BARS // 2
+        middle = left + size + look.BARS // 2
         assert images[0].getpixel((middle + 8, size // 4)) == (31, 119, 180)  # a gain, blue
         assert images[0].getpixel((middle - 8, 3 * size // 4)) == (153, 153, 153)
         assert images[0].getpixel((middle - 8, size // 4)) == (255, 255, 255)
@@ -141,3 +429,69 @@ def test_watch_writes_a_moving_picture(tmp_path):
 def test_watch_refuses(tmp_path, flags, parts):
     pytest.importorskip("matplotlib")
     refused(run("watch", *flags, cwd=tmp_path), *parts)
+
+
+# figure9 and agreement ----------------------------------------------------------------
+
+
+def test_clusters_tell_joints_apart_where_they_are():
+    pytest.importorskip("sklearn")
+    rng = np.random.default_rng(0)
+    z = rng.standard_normal((3, 5, 40)) + 8 * np.arange(3)[:, None, None]
+    tsne, pca, joints, apart, shuffled = look.clusters(z, rng, 30)
+    assert tsne.shape == pca.shape == (90, 2) and joints.tolist() == [0] * 30 + [1] * 30 + [2] * 30
+    assert apart > 0.5 > 0.1 > abs(shuffled)
+    assert look.clusters(z[:1], rng, 30)[3:] == (None, None)  # one agent
+
+
+def test_credit_is_equation_2_of_what_was_executed():
+    model, config = random_model(), fac.PlannerConfig(horizon=2)
+    rng = np.random.default_rng(0)
+    obs = rng.standard_normal((6, 8)).astype(np.float32)
+    actions = rng.uniform(-1, 1, (6, 3)).astype(np.float32)
+    found = look.credit(model, obs, actions, config)
+    assert found.shape == (3, 4)
+    z, expected = model.encode(obs[1:2].T), 0.0
+    for h in range(2):
+        expected = expected + 0.99 ** h * model.reward(z, actions[1 + h].reshape(3, 1, 1))
+        z = model.next(z, actions[1 + h].reshape(3, 1, 1))
+    expected = expected + 0.99 ** 2 * sum(model.q(z, actions[3].reshape(3, 1, 1))) / 2
+    np.testing.assert_allclose(found[:, 1], expected[:, 0], rtol=1e-4)
+
+
+def test_turning_points_are_where_returns_change_most():
+    returns = np.repeat([0.0, 5.0, -1.0], 100)
+    assert look.turning_points(returns) == pytest.approx([100, 200], abs=look.SMOOTH)
+
+
+def test_agreement_finds_the_joint_that_is_wrong():
+    """A student that is its expert agrees; with one agent's Q turned round, that one doesn't."""
+    rng = np.random.default_rng(0)
+    student = random_model()
+    expert = type("Sum", (), {"encode": student.encode, "q": lambda self, z, a: tuple(
+        q.sum(0, keepdims=True) for q in student.q(z, a.reshape(3, 1, -1)))})()
+    obs = rng.standard_normal((8, 5)).astype(np.float32)
+    actions = rng.uniform(-1, 1, (3, 5)).astype(np.float32)
+    np.testing.assert_allclose(look.agreement(student, expert, obs, actions, rng), 1, atol=1e-3)
+    wrong = fac.WorldModel(student.config, {k: v.copy() for k, v in student.params.items()})
+    for name in ("_Q1", "_Q2"):
+        wrong.params[f"{name}.5.weight"][1] *= -1
+    found = look.agreement(wrong, expert, obs, actions, rng).mean(1)
+    np.testing.assert_allclose(found, [1, -1, 1], atol=1e-3)
+
+
+def test_figure9_and_agreement_draw_a_model(tmp_path):
+    pytest.importorskip("sklearn")
+    pytest.importorskip("matplotlib")
+    write_expert(tmp_path / "expert.npz")
+    student = random_model()
+    fac.save_model(tmp_path / "student.npz", student, {"kind": "student", "task": "reacher-hard"})
+    found = last_json(run("figure9", "--model", "student.npz", "--episodes", "2", "--points", "20",
+                          "--json", cwd=tmp_path))
+    assert found["silhouette"] is not None and set(found["moments"]) == {"best", "worst"}
+    assert (tmp_path / "figure9.png").read_bytes()[:4] == b"\x89PNG"
+    found = last_json(run("agreement", "--model", "student.npz", "--expert", "expert.npz",
+                          "--episodes", "1", "--states", "8", "--json", cwd=tmp_path))
+    assert len(found["held_out"]) == len(found["worst_episode"]) == 3
+    assert np.abs(found["when"]).max() <= 1
+    assert (tmp_path / "agreement.png").exists()

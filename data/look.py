@@ -1,0 +1,289 @@
+"""Section 5.6: look into a model: `experiments.py watch`, `figure9` and `agreement` are here."""
+import functools
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+import fac_tdmpc_ref as fac  # noqa: E402
+
+PIXELS, BARS, TEXT = 240, 70, 34  # a picture's side, width of the bars beside, height of the text
+RENDERERS = "from dm_control import suite; suite.load('reacher', 'easy').physics.render(8, 8)"
+
+
+def choose_renderer():
+    """Set MUJOCO_GL to what draws off-screen here; UserError if nothing does."""
+    for backend in filter(None, (os.environ.get("MUJOCO_GL"), "egl", "osmesa")):
+        environment = {**os.environ, "MUJOCO_GL": backend}
+        if not subprocess.run([sys.executable, "-c", RENDERERS], env=environment,
+                              capture_output=True).returncode:
+            os.environ["MUJOCO_GL"] = backend
+            return
+    raise fac.UserError("MuJoCo can't draw off-screen here: install EGL (Debian: libegl1) or "
+                        "OSMesa (libosmesa6)")
+
+
+def shares(model, z, config):
+    """What each agent's own plan from z (N, m, 1) is worth to it above doing nothing, (N,)."""
+    n = model.config.num_agents
+    returns = functools.partial(fac.h_step_return, model, z, config=config)
+    nothing = np.zeros((n, config.horizon + 1, model.config.agent_actions), fac.F32)
+    plan, _, _ = fac.mppi(returns, nothing, config, [np.random.default_rng(0) for _ in range(n)])
+    worth = returns(np.stack([plan, nothing], -1))
+    return worth[:, 0] - worth[:, 1]
+
+
+def watch_episode(path, model, header, environment, seed, decisions, every):
+    """Frames of a model's episode: picture, shares (N,) and return so far of each; and its name
+    with the median milliseconds of a decision."""
+    config = fac.PlannerConfig(**fac.made_for(header, path))
+    frames, total, seconds = [], 0.0, []
+    with fac.Planner(model, config) as planner, fac.progress(f"playing {path}", decisions,
+                                                             "decision") as bar:
+        planner.reset(seed)
+        obs = environment.reset(seed)
+        for t in range(decisions):
+            if t % every == 0:
+                picture = environment.env.physics.render(PIXELS, PIXELS, camera_id=0)
+                frames.append((picture, shares(model, model.encode(obs[:, None]), config), total))
+            begin = time.perf_counter()
+            action = planner.act(obs)
+            seconds.append(time.perf_counter() - begin)
+            obs, reward = environment.step(action)
+            total += reward
+            bar.update()
+    name = f"{header['kind']}, N = {model.config.num_agents}"
+    return frames, name, 1e3 * float(np.median(seconds))
+
+
+def draw_frames(episodes):
+    """PIL images of episodes side by side, each with bars for its agents' shares."""
+    from PIL import Image, ImageDraw
+    width, images = PIXELS + BARS, []
+    largest = [max(np.abs(share).max() for _, share, _ in frames) + 1e-9
+               for frames, *_ in episodes]
+    for columns in zip(*(frames for frames, *_ in episodes)):
+        image = Image.new("RGB", (width * len(episodes), PIXELS + TEXT), "white")
+        draw = ImageDraw.Draw(image)
+        for k, (picture, share, total) in enumerate(columns):
+            left, (_, name, ms) = k * width, episodes[k]
+            image.paste(Image.fromarray(picture), (left, 0))
+            height, middle = PIXELS / len(share), left + PIXELS + BARS / 2
+            for i, value in enumerate(share / largest[k] * (BARS / 2 - 4)):
+                draw.rectangle((min(middle, middle + value), (i + 0.15) * height,
+                                max(middle, middle + value), (i + 0.85) * height),
+                               fill="#1f77b4" if value > 0 else "#999999", outline="black")
+            draw.line((middle, 0, middle, PIXELS), fill="black")
+            draw.text((left + 4, PIXELS + 4), f"{name}: {ms:.1f} ms a decision", fill="black")
+            draw.text((left + 4, PIXELS + 18), f"return so far {total:.0f}", fill="black")
+        images.append(image)
+    return images
+
+
+def command_watch(args):
+    """watch: an episode as a moving picture."""
+    fac.need(Path(args.out).suffix == ".gif", f"{args.out}: expected a name that ends in .gif")
+    fac.pyplot()  # brings Pillow
+    models = [(path, *fac.load_model(path)) for path in (args.model, args.beside) if path]
+    task = args.task or models[0][2].get("task")
+    for _, model, _ in models:
+        fac.check_task(model.config, task)
+    choose_renderer()
+    environment = fac.Environment(task)
+    seed = fac.episode_seeds(args.seed, args.episode + 1)[args.episode]
+    episodes = [watch_episode(*found, environment, seed, args.decisions, args.every)
+                for found in models]
+    images = [image.quantize(64) for image in draw_frames(episodes)]
+    seconds = fac.ACTION_REPEAT * environment.env.control_timestep() * args.every
+    with fac.atomic_file(args.out) as file:
+        images[0].save(file, format="gif", save_all=True, append_images=images[1:], loop=0,
+                       duration=max(20, int(1e3 * seconds)))
+    result = {"out": args.out, "frames": len(images), "bytes": Path(args.out).stat().st_size,
+              "ms": [ms for *_, ms in episodes], "returns": [f[-1][2] for f, *_ in episodes]}
+    print(f"{args.out}: {result['frames']} frames, {result['bytes'] / 1e6:.1f} MB")
+    return result
+
+
+# ------------------------------------------------------------------- Figure 9 and agreement
+
+STYLES = [{"color": color, "linestyle": line, "marker": marker} for color, line, marker in zip(
+    ("#0072b2", "#d55e00", "#009e73", "#555555", "#cc79a7", "#e69f00", "#56b4e9", "#000000"),
+    ("-", "--", "-.", ":") * 2, "os^Dv<>p")]  # told apart in black and white, too
+
+
+def styles(n):
+    """A style for each of n lines; told apart in black and white as long as there are enough."""
+    return [STYLES[i % len(STYLES)] for i in range(n)]
+
+
+SMOOTH = 10  # decisions over which a change of the return counts
+
+
+def clusters(z, rng, points):
+    """Latents (N, m, B) of some states as points: t-SNE and PCA, (n, 2) each, their joints (n,),
+    and the silhouette by joint and by shuffled joints."""
+    try:
+        from sklearn.decomposition import PCA
+        from sklearn.manifold import TSNE
+        from sklearn.metrics import silhouette_score
+    except ImportError:
+        raise fac.UserError("figure9 needs scikit-learn: pip install "
+                            "'fac-tdmpc-ref[experiments]'") from None
+    chosen = z[:, :, rng.choice(z.shape[2], min(points, z.shape[2]), replace=False)]
+    x = chosen.swapaxes(1, 2).reshape(-1, z.shape[1])
+    joints = np.repeat(np.arange(len(z)), chosen.shape[2])
+    flat = (TSNE(random_state=0, init="pca", perplexity=min(30, len(x) / 4)).fit_transform(x),
+            PCA(2).fit_transform(x))
+    one = len(z) == 1  # no other joints to be apart from
+    return *flat, joints, *(None if one else float(silhouette_score(x, labels))
+                            for labels in (joints, rng.permutation(joints)))
+
+
+def credit(model, obs, actions, config):
+    """Each agent's return over the next H decisions of an episode, as it was played: (N, T - H).
+
+    obs (T, O), actions (T, A): Equation 2 for the actions that were executed."""
+    n, d = model.config.num_agents, model.config.agent_actions
+    z, H = model.encode(np.ascontiguousarray(obs.T)), config.horizon
+    shares = [fac.h_step_return(model, z[:, :, t:t + 1],
+                                actions[t:t + H + 1].reshape(H + 1, n, d).swapaxes(0, 1)[..., None],
+                                config)[:, 0] for t in range(len(obs) - H)]
+    return np.stack(shares, 1)
+
+
+def turning_points(returns, count=2):
+    """Decisions around which a return (T,) changes most, apart from each other, in order."""
+    change = np.abs(returns[SMOOTH:] - returns[:-SMOOTH])
+    found = []
+    for _ in range(count):
+        t = int(np.argmax(change))
+        found.append(t + SMOOTH // 2)
+        change[max(0, t - 3 * SMOOTH):t + 3 * SMOOTH] = -1
+    return sorted(found)
+
+
+def frames_at(task, seed, actions, moments):
+    """Pictures of an episode, played again, before these decisions; {} where nothing draws."""
+    try:
+        choose_renderer()
+    except fac.UserError as error:
+        print(error, file=sys.stderr)
+        return {}
+    environment, found = fac.Environment(task), {}
+    environment.reset(seed)
+    for t in range(max(moments) + 1):
+        if t in moments:
+            found[t] = environment.env.physics.render(PIXELS, PIXELS, camera_id=0)
+        environment.step(actions[t])
+    return found
+
+
+def command_figure9(args):
+    """figure9: latents by joint, and what each joint contributes in the best and worst episode."""
+    model, header, task = open_model(args)
+    plt, began = fac.pyplot(), time.time()
+    config = fac.PlannerConfig(**fac.made_for(header, args.model))
+    seeds = fac.episode_seeds(args.seed, args.episodes)
+    obs, actions, rewards, _ = fac.play(model, task, config, seeds)
+    returns, rng = rewards.sum(1), np.random.default_rng(0)
+    z = model.encode(np.ascontiguousarray(obs.reshape(-1, obs.shape[2]).T))
+    tsne, pca, joints, apart, shuffled = clusters(z, rng, args.points)
+    figure, grid = plt.subplots(3, 3, figsize=(11, 9), layout="constrained")
+    for ax, points, name in ((grid[0, 0], tsne, "t-SNE"), (grid[0, 1], pca, "PCA")):
+        for i, style in enumerate(styles(len(z))):
+            ax.scatter(*points[joints == i].T, s=7, color=style["color"], marker=style["marker"],
+                       label=f"joint {i}")
+        ax.set(title=f"latents, {name}", xticks=[], yticks=[])
+    grid[0, 1].legend(fontsize=7)
+    grid[0, 2].axis("off")
+    moments = {}
+    for row, name, episode in zip(grid[1:], ("best", "worst"),
+                                  (int(returns.argmax()), int(returns.argmin()))):
+        shares = credit(model, obs[episode], actions[episode], config)
+        moments[name] = turning_points(shares.sum(0))
+        pictures = frames_at(task, seeds[episode], actions[episode], moments[name])
+        for i, (share, style) in enumerate(zip(shares, styles(len(z)))):
+            row[0].plot(share - share.mean(), linewidth=1, label=f"joint {i}",
+                        color=style["color"], linestyle=style["linestyle"])
+        row[0].plot(shares.sum(0) - shares.sum(0).mean(), color="black", label="sum")
+        row[0].set(title=f"{name} episode: {returns[episode]:.0f}", xlabel="decision",
+                   ylabel=f"{config.horizon}-step return less its mean")
+        for ax, t in zip(row[1:], moments[name]):
+            row[0].axvline(t, color="black", linestyle="--", linewidth=0.8)
+            ax.axis("off")
+            if t in pictures:
+                ax.imshow(pictures[t])
+                ax.set_title(f"decision {t}")
+    grid[1, 0].legend(fontsize=7)
+    fac.save_figure(args.out, figure)
+    result = {"out": args.out, "task": task, "episodes": args.episodes, "silhouette": apart,
+              "silhouette_shuffled": shuffled, "return_best": float(returns.max()),
+              "return_worst": float(returns.min()), "moments": moments,
+              "seconds": round(time.time() - began, 1)}
+    if apart is not None:
+        print(f"silhouette by joint {apart:.2f}, shuffled {shuffled:.2f}")
+    print(args.out)
+    return result
+
+
+def agreement(student, expert, obs, actions, rng, values=32):
+    """Spearman's correlation of an agent's share of Q with the expert's Q when one action
+    dimension takes other values: (A, B) of states obs (O, B), around actions (A, B)."""
+    z, z_expert, dim_action = student.encode(obs), expert.encode(obs), len(actions)
+    n, d, batch = student.config.num_agents, student.config.agent_actions, obs.shape[1]
+    found = []
+    for j in range(dim_action):
+        a = np.repeat(actions, values, 1)
+        a[j] = rng.uniform(-1, 1, batch * values)
+        own = sum(student.q(np.repeat(z, values, 2), a.reshape(n, d, -1)))[j // d]
+        theirs = sum(expert.q(np.repeat(z_expert, values, 2), a[None]))[0]
+        found.append(fac.spearman(*(q.reshape(batch, values) for q in (own, theirs))))
+    return np.stack(found)
+
+
+def command_agreement(args):
+    """agreement: which joint's share ranks its actions as the expert's Q does, and when."""
+    student, header, task = open_model(args)
+    expert, _ = fac.load_model(args.expert or fac.data_file(task, "expert.npz"))
+    replay, plt = fac.Replay(args.replay or fac.data_file(task, "replay.npz")), fac.pyplot()
+    rng, config = np.random.default_rng(args.seed), fac.PlannerConfig(
+        **fac.made_for(header, args.model))
+    _, held_out = replay.starts(1, fac.DistillConfig.held_out)
+    obs, actions = replay.sequences(rng.choice(held_out, args.states), 1)
+    known = agreement(student, expert, obs, actions[0], rng)
+    played, done, rewards, _ = fac.play(student, task, config,
+                                        fac.episode_seeds(args.seed, args.episodes))
+    worst = int(rewards.sum(1).argmin())
+    own = agreement(student, expert, np.ascontiguousarray(played[worst].T),
+                    np.ascontiguousarray(done[worst].T), rng)
+    width = fac.EPISODE_STEPS // 20
+    when = own.reshape(len(own), -1, width).mean(2)
+    figure, ax = plt.subplots(figsize=(8, 3.6), layout="constrained")
+    for j, (line, style) in enumerate(zip(when, styles(len(own)))):
+        ax.plot(np.arange(len(line)) * width + width / 2, line, label=f"joint {j}", markersize=4,
+                **style)
+    ax.set(xlabel="decision", ylabel="rank correlation with the expert's Q", ylim=(None, 1),
+           title=f"{task}, the worst of {args.episodes} episodes: {rewards[worst].sum():.0f}")
+    ax.legend(fontsize=7)
+    ax.grid(alpha=0.3)
+    fac.save_figure(args.out, figure)
+    result = {"out": args.out, "task": task, "held_out": known.mean(1).tolist(),
+              "worst_episode": own.mean(1).tolist(), "when": when.tolist(),
+              "return_worst": float(rewards[worst].sum())}
+    fac.print_table([("joint", *map(str, range(len(own)))), *(
+        (name, *(f"{x:.2f}" for x in result[key]))
+        for name, key in (("held-out states", "held_out"), ("worst episode", "worst_episode")))])
+    print(args.out)
+    return result
+
+
+def open_model(args):
+    """(model, header, task) that --model and --task name."""
+    model, header = fac.load_model(args.model)
+    task = args.task or header.get("task")
+    fac.check_task(model.config, task)
+    return model, header, task
