@@ -1438,12 +1438,9 @@ class Replay:
         self.observation, self.action = arrays["observation"], arrays["action"]
         self.ends = np.flatnonzero(~arrays["continues"])
         self.dim_obs, self.dim_action = self.observation.shape[1], self.action.shape[1]
+        self.transitions = len(self.observation) - len(self.ends)
         need(self.ends[-1:].tolist() == [len(self.observation) - 1],
              f"{path}: continues: expected False in the last row")
-
-    @property
-    def transitions(self):
-        return len(self.observation) - len(self.ends)
 
     def starts(self, steps, held_out):
         """Rows from which `steps` actions stay in their episode: (training, held-out) rows.
@@ -1662,13 +1659,17 @@ def write_json(path, found):
 
 
 def pyplot():
-    """matplotlib.pyplot, drawing without a display; UserError where it is missing."""
+    """matplotlib.pyplot, in this project's style, without a display; UserError if missing."""
     try:
         import matplotlib
     except ImportError:
         raise UserError("pictures need matplotlib: pip install 'fac-tdmpc-ref[plots]'") from None
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    cycle = matplotlib.cycler(  # told apart in black and white, too
+        color=["#0072b2", "#d55e00", "#009e73", "#333333", "#cc79a7", "#e69f00", "#56b4e9"],
+        linestyle=["-", "--", "-.", ":", "-", "--", "-."])
+    plt.rcParams.update({"axes.grid": True, "grid.alpha": 0.3, "axes.prop_cycle": cycle})
     return plt
 
 
@@ -1695,7 +1696,6 @@ def draw_curve(path, curve, title):
             ax.plot(columns["step"], columns[key], label=label)
         ax.set(xlabel="gradient step")
         ax.legend()
-        ax.grid(alpha=0.3)
     axes[0].set(yscale="log", ylabel="KL divergence", title=title)
     axes[1].set(ylim=(None, 1), ylabel="rank correlation", title="held-out states")
     save_figure(path, figure)
@@ -1814,10 +1814,9 @@ def time_both(expert, student, planning, obs):
         seconds = interleaved_seconds([functools.partial(p.act, obs) for p in planners], 20,
                                       "timing")
     central, alone, parallel = (1e3 * np.median(seconds, 0)).tolist()
-    fastest = min(alone, parallel)
-    return {"plan_ms_expert": central, "plan_ms_expert_own": central, "plan_ms_student": fastest,
-            "speedup": central / fastest, "plan_ms_student_in_process": alone,
-            "plan_workers": beside if parallel < alone else 0}
+    return {"plan_ms_expert": central, "plan_ms_expert_own": central,
+            "plan_ms_student": min(alone, parallel), "speedup": central / min(alone, parallel),
+            "plan_ms_student_in_process": alone, "plan_workers": beside if parallel < alone else 0}
 
 
 def report(result, planning, eval_seed):

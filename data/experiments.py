@@ -27,7 +27,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import fac_tdmpc_ref as fac  # noqa: E402
-from look import STYLES, command_agreement, command_figure9, command_watch, styles  # noqa: E402
+from look import command_agreement, command_figure9, command_watch  # noqa: E402
 from speed import ROBOTS, command_table3  # noqa: E402
 
 # ------------------------------------------------------ runs, many at a time, each only once
@@ -502,16 +502,15 @@ def draw_lines(path, panels, xlabel, **axes):
         if lines is None:
             ax.remove()
             continue
-        for style, (label, points) in zip(styles(len(lines)), lines.items()):
+        for label, points in lines.items():
             x = sorted(points)
             mean, std = (np.array([f(points[v]) for v in x]) for f in (np.mean, np.std))
-            ax.plot(x, mean, label=label, markersize=4, **style)
-            ax.fill_between(x, mean - std, mean + std, color=style["color"], alpha=0.15)
+            (line,) = ax.plot(x, mean, marker=".", label=label)
+            ax.fill_between(x, mean - std, mean + std, color=line.get_color(), alpha=0.15)
         if level is not None:
             ax.axhline(level, color="black", linewidth=0.8, linestyle=(0, (1, 3)), label="expert")
         ax.set(title=title, xlabel=xlabel, ylabel="episode return", ylim=(0, None), **axes)
-        ax.grid(alpha=0.3)
-        ax.legend(fontsize=7)
+        ax.legend()
     fac.save_figure(path, figure)
 
 
@@ -620,13 +619,12 @@ def report_figure8(_, rows, figures):
                 joints = sorted(j for k, j in values if k == kind)
                 ax.bar(np.arange(len(joints)) + 0.4 * i - 0.2,
                        [np.mean(values[kind, j]) for j in joints], 0.38, label=case,
-                       color=STYLES[i]["color"], hatch=("", "//")[i % 2], edgecolor="black")
+                       color=f"C{i}", hatch=("", "//")[i % 2], edgecolor="black")
                 if ("none", 0) in values:
-                    ax.axhline(np.mean(values["none", 0]), color=STYLES[i]["color"],
-                               linestyle=STYLES[i]["linestyle"], linewidth=1)
+                    ax.axhline(np.mean(values["none", 0]), color=f"C{i}", linestyle=("-", "--")[i])
             what = "one action is noise" if kind == "noise" else f"one motor x {kind}"
             ax.set(title=f"{task}: {what}", xlabel="action dimension", ylabel="episode return")
-        row[0].legend(fontsize=7)
+        row[0].legend()
         result[task] = {case: {kind: float(np.mean([np.mean(v) for (k, _), v in values.items()
                                                     if k == kind] or [np.nan]))
                                for kind in ("none", *kinds)} for case, values in cases.items()}
@@ -752,7 +750,7 @@ def make_parser():
                      help="[150]")
     sub.add_argument("--every", type=positive, default=2,
                      help="decisions between two frames [2]")
-    sub.add_argument("--out", required=True, help="a .gif file")
+    sub.add_argument("--out", required=True, help="a .gif or an .mp4 file")
     for name, run, help, episodes in (
             ("figure9", command_figure9, "Section 5.6: latents by joint (t-SNE, PCA), and each "
              "joint's return in the best and the worst episode.", 100),

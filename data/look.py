@@ -86,8 +86,15 @@ def draw_frames(episodes):
 
 def command_watch(args):
     """watch: an episode as a moving picture."""
-    fac.need(Path(args.out).suffix == ".gif", f"{args.out}: expected a name that ends in .gif")
+    kind = Path(args.out).suffix
+    fac.need(kind in (".gif", ".mp4"), f"{args.out}: expected a name that ends in .gif or .mp4")
     fac.pyplot()  # brings Pillow
+    if kind == ".mp4":
+        try:
+            import imageio_ffmpeg  # noqa: F401
+        except ImportError:
+            raise fac.UserError(".mp4 needs imageio: pip install 'fac-tdmpc-ref[experiments]'; or "
+                                "write a .gif") from None
     models = [(path, *fac.load_model(path)) for path in (args.model, args.beside) if path]
     task = args.task or models[0][2].get("task")
     for _, model, _ in models:
@@ -97,11 +104,17 @@ def command_watch(args):
     seed = fac.episode_seeds(args.seed, args.episode + 1)[args.episode]
     episodes = [watch_episode(*found, environment, seed, args.decisions, args.every)
                 for found in models]
-    images = [image.quantize(64) for image in draw_frames(episodes)]
-    seconds = fac.ACTION_REPEAT * environment.env.control_timestep() * args.every
+    images = draw_frames(episodes)
+    seconds = max(0.02, fac.ACTION_REPEAT * environment.env.control_timestep() * args.every)
     with fac.atomic_file(args.out) as file:
-        images[0].save(file, format="gif", save_all=True, append_images=images[1:], loop=0,
-                       duration=max(20, int(1e3 * seconds)))
+        if kind == ".mp4":
+            import imageio
+            imageio.mimwrite(file, [np.asarray(image) for image in images], format="mp4",
+                             fps=1 / seconds, macro_block_size=2)
+        else:
+            images = [image.quantize(64) for image in images]
+            images[0].save(file, format="gif", save_all=True, append_images=images[1:], loop=0,
+                           duration=int(1e3 * seconds))
     result = {"out": args.out, "frames": len(images), "bytes": Path(args.out).stat().st_size,
               "ms": [ms for *_, ms in episodes], "returns": [f[-1][2] for f, *_ in episodes]}
     print(f"{args.out}: {result['frames']} frames, {result['bytes'] / 1e6:.1f} MB")
@@ -109,16 +122,6 @@ def command_watch(args):
 
 
 # ------------------------------------------------------------------- Figure 9 and agreement
-
-STYLES = [{"color": color, "linestyle": line, "marker": marker} for color, line, marker in zip(
-    ("#0072b2", "#d55e00", "#009e73", "#555555", "#cc79a7", "#e69f00", "#56b4e9", "#000000"),
-    ("-", "--", "-.", ":") * 2, "os^Dv<>p")]  # told apart in black and white, too
-
-
-def styles(n):
-    """A style for each of n lines; told apart in black and white as long as there are enough."""
-    return [STYLES[i % len(STYLES)] for i in range(n)]
-
 
 SMOOTH = 10  # decisions over which a change of the return counts
 
@@ -194,11 +197,10 @@ def command_figure9(args):
     tsne, pca, joints, apart, shuffled = clusters(z, rng, args.points)
     figure, grid = plt.subplots(3, 3, figsize=(11, 9), layout="constrained")
     for ax, points, name in ((grid[0, 0], tsne, "t-SNE"), (grid[0, 1], pca, "PCA")):
-        for i, style in enumerate(styles(len(z))):
-            ax.scatter(*points[joints == i].T, s=7, color=style["color"], marker=style["marker"],
-                       label=f"joint {i}")
+        for i in range(len(z)):
+            ax.scatter(*points[joints == i].T, s=7, marker="os^Dv<>p"[i % 8], label=f"joint {i}")
         ax.set(title=f"latents, {name}", xticks=[], yticks=[])
-    grid[0, 1].legend(fontsize=7)
+    grid[0, 1].legend()
     grid[0, 2].axis("off")
     moments = {}
     for row, name, episode in zip(grid[1:], ("best", "worst"),
@@ -206,10 +208,9 @@ def command_figure9(args):
         shares = credit(model, obs[episode], actions[episode], config)
         moments[name] = turning_points(shares.sum(0))
         pictures = frames_at(task, seeds[episode], actions[episode], moments[name])
-        for i, (share, style) in enumerate(zip(shares, styles(len(z)))):
-            row[0].plot(share - share.mean(), linewidth=1, label=f"joint {i}",
-                        color=style["color"], linestyle=style["linestyle"])
-        row[0].plot(shares.sum(0) - shares.sum(0).mean(), color="black", label="sum")
+        for i, share in enumerate(shares):
+            row[0].plot(share - share.mean(), linewidth=1, label=f"joint {i}")
+        row[0].plot(shares.sum(0) - shares.sum(0).mean(), "k-", label="sum")
         row[0].set(title=f"{name} episode: {returns[episode]:.0f}", xlabel="decision",
                    ylabel=f"{config.horizon}-step return less its mean")
         for ax, t in zip(row[1:], moments[name]):
@@ -218,7 +219,7 @@ def command_figure9(args):
             if t in pictures:
                 ax.imshow(pictures[t])
                 ax.set_title(f"decision {t}")
-    grid[1, 0].legend(fontsize=7)
+    grid[1, 0].legend()
     fac.save_figure(args.out, figure)
     result = {"out": args.out, "task": task, "episodes": args.episodes, "silhouette": apart,
               "silhouette_shuffled": shuffled, "return_best": float(returns.max()),
@@ -263,13 +264,11 @@ def command_agreement(args):
     width = fac.EPISODE_STEPS // 20
     when = own.reshape(len(own), -1, width).mean(2)
     figure, ax = plt.subplots(figsize=(8, 3.6), layout="constrained")
-    for j, (line, style) in enumerate(zip(when, styles(len(own)))):
-        ax.plot(np.arange(len(line)) * width + width / 2, line, label=f"joint {j}", markersize=4,
-                **style)
+    for j, line in enumerate(when):
+        ax.plot(np.arange(len(line)) * width + width / 2, line, label=f"joint {j}")
     ax.set(xlabel="decision", ylabel="rank correlation with the expert's Q", ylim=(None, 1),
            title=f"{task}, the worst of {args.episodes} episodes: {rewards[worst].sum():.0f}")
-    ax.legend(fontsize=7)
-    ax.grid(alpha=0.3)
+    ax.legend()
     fac.save_figure(args.out, figure)
     result = {"out": args.out, "task": task, "held_out": known.mean(1).tolist(),
               "worst_episode": own.mean(1).tolist(), "when": when.tolist(),

@@ -254,7 +254,7 @@ def draw_prediction(path, prediction, robots):
             ax.bar(np.arange(len(robots)) + (i - 2.5) * 0.14, [r["ms_mean"] for r in rows], 0.13,
                    yerr=[r["ms_std"] for r in rows], label=f"{model}, {mode}")
         ax.set(yscale="log", ylabel=f"${function}$, ms")
-        ax.grid(axis="y", alpha=0.3)
+        ax.grid(False, axis="x")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     axes[-1].set_xticks(range(len(robots)), [f"{r}\nN = {ROBOTS[r][1]}" for r in robots])
     fac.save_figure(path, figure)

@@ -556,7 +556,6 @@ def draw(path, curve, title):
             axes.plot(*zip(*points), label=label, **style)
     axes.set(xlabel="decisions (two environment steps each)", ylabel="return", title=title)
     axes.legend()
-    axes.grid(alpha=0.3)
     fac.save_figure(path, figure)
     return True
 

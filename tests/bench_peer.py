@@ -1,7 +1,8 @@
 """NumPy against PyTorch on one machine, in one run: `python tests/bench_peer.py [--json]`.
 
 The same models, the same MPPI and the same distillation step, written plainly in PyTorch
-(eager, `inference_mode`; batched `baddbmm` for the agents; `torch.compile` where it works).
+(eager, `inference_mode`; batched `baddbmm` for the agents; `torch.compile` where it works); a
+decision also in JAX, compiled as a whole (pip install -e '.[peers]').
 Both take turns, so that noise hits both; figures are medians of NumPy's time over PyTorch's in
 the same turn, below 1 is faster. Sizes are section 5.1's (latent and hidden 512 // N), MPPI is
 Table 2's (512 samples, 6 iterations, horizon 3).
@@ -90,6 +91,71 @@ class TorchPlanner:
         return elites[torch.arange(n), 0, pick[:, 0]].flatten().numpy()
 
 
+def jax_planner(model, config):
+    """A decision in JAX: the same MPPI as one jax.jit; None where JAX is missing."""
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false "
+                          "intra_op_parallelism_threads=1")
+    try:
+        import jax
+        import jax.numpy as jnp
+    except ImportError:
+        return None
+    params, n, m = jax.tree.map(jnp.asarray, model.params), model.config.num_agents, -1
+    d, steps = model.config.agent_actions, config.horizon + 1
+
+    def run(kinds, name, x):
+        for i, kind in enumerate(kinds):
+            W, b = params.get(f"{name}.{i}.weight"), params.get(f"{name}.{i}.bias")
+            if kind == "linear":
+                x = W @ x + b
+            elif kind == "norm":
+                x = x - x.mean(1, keepdims=True)
+                x = W * x / jnp.sqrt((x ** 2).mean(1, keepdims=True) + fac.NORM_EPS) + b
+            else:
+                x = jax.nn.elu(x) if kind == "elu" else jnp.tanh(x)
+        return x
+
+    def returns(z, actions):  # (N, m, S), (N, L, d, S) -> (N, S)
+        total = 0.0
+        for h in range(config.horizon):
+            x = jnp.concatenate([z, actions[:, h]], 1)
+            total = total + config.discount ** h * run(fac.MLP, "_reward", x)[:, 0]
+            z = run(fac.MLP, "_dynamics", x)
+        x = jnp.concatenate([z, actions[:, -1]], 1)
+        q = run(fac.QNET, "_Q1", x) + run(fac.QNET, "_Q2", x)
+        return total + config.discount ** config.horizon * q[:, 0] / 2
+
+    @jax.jit
+    def act(obs, mean, key):
+        z = run(fac.ENCODER, "_encoder", obs[None, :, None]).reshape(n, m, 1)
+        z, std = jnp.broadcast_to(z, (*z.shape[:2], config.samples)), config.max_std
+        for _ in range(config.iterations):
+            key, part = jax.random.split(key)
+            noise = jax.random.normal(part, (n, steps, d, config.samples))
+            actions = jnp.clip(mean + std * noise, -1, 1)
+            top, index = jax.lax.top_k(returns(z, actions), config.num_elites)
+            elites = jnp.take_along_axis(actions, index[:, None, None], 3)
+            score = jax.nn.softmax(config.inverse_temperature * top, 1)
+            p = score[:, None, None]
+            new = (p * elites).sum(3, keepdims=True)
+            std = jnp.sqrt((p * (elites - new) ** 2).sum(3, keepdims=True))
+            std = jnp.clip(std, config.min_std, config.max_std)
+            mean = config.momentum * mean + (1 - config.momentum) * new
+        key, part = jax.random.split(key)
+        pick = jax.random.categorical(part, jnp.log(score))
+        action = jnp.take_along_axis(elites[:, 0], pick[:, None, None], 2).ravel()
+        return action, jnp.concatenate([mean[:, 1:], 0 * mean[:, :1]], 1), key
+
+    state = [jnp.zeros((n, steps, d, 1)), jax.random.key(0)]
+
+    def decide(obs):
+        action, *state[:] = act(obs, *state)
+        return np.asarray(action)
+
+    decide.returns = returns
+    return decide
+
+
 def make_model(n, dim_action, seed=0):
     """Section 5.1's sizes for N agents, with random weights (last layers too)."""
     width, rng = 512 // n, np.random.default_rng(seed)
@@ -114,8 +180,8 @@ def ratios(ours, theirs, turns):
     return float(np.median(seconds[:, 0] / seconds[:, 1])), *1e3 * np.median(seconds, 0)
 
 
-def planning(n, dim_action, turns, compiled=False):
-    """(ratio, our ms, PyTorch's ms) of one decision, one thread each."""
+def planning(n, dim_action, turns, compiled=False, jax=False):
+    """(ratio, our ms, theirs) of one decision, one thread each; None where JAX is missing."""
     model, config = make_model(n, dim_action), fac.PlannerConfig(samples=512, iterations=6)
     obs = np.random.default_rng(1).standard_normal(24).astype(np.float32)
     theirs = TorchPlanner(model, config)
@@ -124,12 +190,19 @@ def planning(n, dim_action, turns, compiled=False):
                                  actions.numpy().swapaxes(2, 3), config)
     with torch.inference_mode():
         found = theirs.returns(z[:, :1].expand(-1, 7, -1), actions).numpy()
+    decide = theirs.act
+    if jax:
+        decide = jax_planner(model, config)
+        if decide is None:
+            return None
+        found = np.asarray(decide.returns(z[:, :1].numpy().swapaxes(1, 2).repeat(7, 2),
+                                          actions.numpy().swapaxes(2, 3)))
     assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max(), "the models differ"
     if compiled:
         theirs.returns = torch.compile(theirs.returns)
     torch.set_num_threads(1)
     with fac.Planner(model, config) as ours:
-        return ratios(lambda: ours.act(obs), lambda: theirs.act(obs), turns)
+        return ratios(lambda: ours.act(obs), lambda: decide(obs), turns)
 
 
 class TorchDistiller:
@@ -227,18 +300,23 @@ def main():
     parser.add_argument("--turns", type=int, default=9, help="of each comparison [9]")
     parser.add_argument("--json", action="store_true", help="print one JSON object as last line")
     args = parser.parse_args()
-    result = {"central_ratio": None, "fac_ratio": {}, "distill_ratio": {}, "update_ratio": {},
+    result = {"central_ratio": None, "fac_ratio": {}, "jax_ratio": {}, "distill_ratio": {},
+              "update_ratio": {},
               "cores": fac.cores(), "torch": torch.__version__, "numpy": np.__version__}
 
-    def show(what, found, threads=1):
+    def show(what, found, threads=1, peer="PyTorch"):
         per = 20 if what.startswith("distillation") else 1
         print(f"{what:<42}{threads} thread{'s' * (threads > 1):<2} NumPy {found[1] / per:7.1f} ms"
-              f"  PyTorch {found[2] / per:7.1f} ms  ratio {found[0]:.2f}", flush=True)
+              f"  {peer} {found[2] / per:7.1f} ms  ratio {found[0]:.2f}", flush=True)
         return found[0]
 
     result["central_ratio"] = show("plan, TD-MPC (N = 1, latent 512)", planning(1, 6, args.turns))
     for n in (3, 6, 12, 21):
         result["fac_ratio"][str(n)] = show(f"plan, Fac-TDMPC (N = {n})", planning(n, n, args.turns))
+    for n in (1, 6, 21):
+        found = planning(n, max(n, 6), args.turns, jax=True)
+        if found:
+            result["jax_ratio"][str(n)] = show(f"plan, N = {n}, jax.jit", found, peer="JAX    ")
     for n in (1, 6):
         try:
             show(f"plan, N = {n}, torch.compile", planning(n, 6, args.turns, compiled=True))

@@ -410,22 +410,28 @@ def test_frames_hold_pictures_and_bars():
         assert images[0].getpixel((middle - 8, size // 4)) == (255, 255, 255)
 
 
-def test_watch_writes_a_moving_picture(tmp_path):
+@pytest.mark.parametrize("name", ["x.gif", "x.mp4"])
+def test_watch_writes_a_moving_picture(tmp_path, name):
     image = pytest.importorskip("PIL.Image")
+    pytest.importorskip("imageio_ffmpeg" if name == "x.mp4" else "PIL")
     expert = fac.data_file("reacher-easy", "expert.npz")
-    done = run("watch", "--model", expert, "--beside", expert, "--decisions", "4", "--out", "x.gif",
+    done = run("watch", "--model", expert, "--beside", expert, "--decisions", "4", "--out", name,
                "--json", cwd=tmp_path)
     if "can't draw off-screen" in done.stderr:
         pytest.skip("neither EGL nor OSMesa here")
     result = last_json(done)
     assert result["frames"] == 2 and result["returns"][0] == result["returns"][1]
-    with image.open(tmp_path / "x.gif") as found:
-        assert found.n_frames == 2 and result["bytes"] == (tmp_path / "x.gif").stat().st_size
+    assert result["bytes"] == (tmp_path / name).stat().st_size
+    if name == "x.mp4":
+        assert (tmp_path / name).read_bytes()[4:8] == b"ftyp"
+        return
+    with image.open(tmp_path / name) as found:
+        assert found.n_frames == 2
 
 
 @pytest.mark.parametrize("flags, parts", [
     (["--model", "none.npz", "--out", "x.gif"], ["none.npz", "no such file"]),
-    (["--model", "none.npz", "--out", "x.png"], ["x.png", ".gif"])])
+    (["--model", "none.npz", "--out", "x.png"], ["x.png", ".gif", ".mp4"])])
 def test_watch_refuses(tmp_path, flags, parts):
     pytest.importorskip("matplotlib")
     refused(run("watch", *flags, cwd=tmp_path), *parts)
