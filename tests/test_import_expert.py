@@ -1,6 +1,6 @@
 """Tests of data/import_expert.py: what it reads, what it refuses, and that no file runs or costs.
 
-FUZZ=10000 pytest tests/test_import_expert.py -k fuzz -s   # mutated files of each kind [250]
+pytest tests/test_import_expert.py -k fuzz --fuzz 10000   # mutated files of each kind [250]
 """
 import collections
 import io
@@ -23,7 +23,6 @@ import fac_tdmpc_ref as fac
 import import_expert
 from test_data import refusal
 
-FUZZ = int(os.environ.get("FUZZ", 250))
 MIB = 1 << 20
 TASK, SIZES = "reacher-easy", fac.ModelConfig(8, 3, 1, 4, 5, 6)
 KINDS = {"<f8": "Double", "<f4": "Float", "<f2": "Half", "<i8": "Long"}
@@ -711,17 +710,18 @@ def fuzzed(folder, kind):
 
 @pytest.mark.parametrize("kind", ["file .pt", "member .pt", "program .pt", "file .npz",
                                   "member .npz", "file .safetensors"])
-def test_fuzz(tmp_path, kind, capsys):
+def test_fuzz(tmp_path, kind, capsys, pytestconfig):
     """Every outcome is an import or a UserError; no file beside; less than 32 MiB a file."""
     if kind.endswith("safetensors"):
         pytest.importorskip("safetensors")
+    files = pytestconfig.getoption("fuzz")
     (tmp_path / "in").mkdir()
     make, suffix = fuzzed(tmp_path / "in", kind)
     complete = not kind.startswith("program")  # one that holds an expert to begin with
     counts, began = collections.Counter(), time.perf_counter()
     path, highest = tmp_path / "in" / f"mutated{suffix}", 0
     tracemalloc.start()
-    for seed in range(FUZZ):
+    for seed in range(files):
         path.write_bytes(make(np.random.default_rng([seed, len(kind)])))
         tracemalloc.reset_peak()
         status = import_expert.main([str(path), "--task", TASK, "--out", str(tmp_path / "out")])
@@ -732,12 +732,12 @@ def test_fuzz(tmp_path, kind, capsys):
     errors = capsys.readouterr().err
     assert errors.count("import_expert.py: error: ") == counts[2] and "Traceback" not in errors
     assert highest < 32 * MIB
-    assert counts[2] and (counts[0] or not complete or FUZZ < 250)
+    assert counts[2] and (counts[0] or not complete or files < 250)
     assert {p.name for p in tmp_path.iterdir()} <= {"in", "out"}
     assert {p.name for p in (tmp_path / "in").iterdir()} <= {f"model{suffix}", path.name}
     assert not counts[0] or {p.name for p in (tmp_path / "out").iterdir()} == {"expert.npz"}
     with capsys.disabled():
-        if "FUZZ" in os.environ:
+        if files > 250:
             rss = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
             print(f"\n{kind}: {counts[0]} loaded, {counts[2]} refused, 0 others; at most "
                   f"{highest / MIB:.1f} MiB a file, {rss} MiB the process; "
