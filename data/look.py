@@ -202,6 +202,8 @@ def command_figure9(args):
         ax.set(title=f"latents, {name}", xticks=[], yticks=[])
     grid[0, 1].legend()
     grid[0, 2].axis("off")
+    if apart is not None:
+        grid[0, 2].text(0, 0.5, f"silhouette by joint {apart:.2f}\njoints shuffled {shuffled:.2f}")
     moments = {}
     for row, name, episode in zip(grid[1:], ("best", "worst"),
                                   (int(returns.argmax()), int(returns.argmin()))):
