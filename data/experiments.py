@@ -39,7 +39,8 @@ ROW = (*KEY, "step", "return_mean", "return_std", "return_min", "expert_mean", "
 
 
 def make_run(task, seed, case, **settings):
-    """A run as its rows begin: settings, of which None means not set, as JSON."""
+    """A run as its rows begin: settings, of which None means not set, as JSON. A run is known by
+    what is set: after a change of the defaults its CSV is of no use."""
     settings = {k: v for k, v in settings.items() if v is not None}
     return {"task": task, "seed": str(seed), "case": case,
             "settings": json.dumps(settings, sort_keys=True)}
@@ -122,24 +123,20 @@ def run_all(args, function, runs):
 
 
 def connect(args):
-    """joblib's arguments for where runs run: processes here, or a dask or ray cluster."""
-    backend, address = getattr(args, "backend", None), getattr(args, "scheduler", None)
-    try:
-        if backend == "dask":
+    """joblib's arguments for where runs run: processes here, or a dask cluster."""
+    backend, address = getattr(args, "backend", "loky"), getattr(args, "scheduler", None)
+    if backend == "dask":
+        try:
             from dask.distributed import Client
-            fac.need(address, "--backend dask needs --scheduler tcp://HOST:PORT")
+        except ImportError:
+            raise fac.UserError("--backend dask needs it: pip install 'fac-tdmpc-ref[cluster]'"
+                                ) from None
+        fac.need(address, "--backend dask needs --scheduler tcp://HOST:PORT")
+        try:
             Client(address, timeout=10)
-        elif backend == "ray":
-            import ray
-            from ray.util.joblib import register_ray
-            ray.init(address, ignore_reinit_error=True)
-            register_ray()
-    except ImportError:
-        raise fac.UserError(f"--backend {backend} needs it: pip install "
-                            "'fac-tdmpc-ref[cluster]'") from None
-    except (OSError, ConnectionError) as error:
-        raise fac.UserError(f"--scheduler {address}: {error}") from None
-    return {"backend": backend or "loky"}
+        except (OSError, ValueError) as error:
+            raise fac.UserError(f"--scheduler {address}: {error}") from None
+    return {"backend": backend}
 
 
 def episodes(model, task, planning, seeds, environment=None):
@@ -731,9 +728,10 @@ def make_parser():
                    ["reacher-hard"], steps=steps, evaluations=1)
     sub.add_argument("--set", nargs="+", required=True, metavar="SETTING=VALUE,...",
                      help="e.g. lr=1e-3,3e-4 batch-size=16,32; see distill --help")
-    sub.add_argument("--backend", choices=("dask", "ray"), help="run on a cluster, whose workers "
-                     "find data/ on their PYTHONPATH [processes of this machine]")
-    sub.add_argument("--scheduler", help="dask: tcp://HOST:PORT; ray: an address [its own]")
+    sub.add_argument("--backend", choices=("loky", "dask"), default="loky", help="processes of "
+                     "this machine, or a cluster whose workers have this repository's data/ on "
+                     "their PYTHONPATH [loky]")
+    sub.add_argument("--scheduler", help="the cluster's, tcp://HOST:PORT")
     sub = fac.add_command(commands, "report", command_report, "Tables and figures from the CSVs: "
                           "data/results/report.md, data/figures/figure*.png.")
     sub.add_argument("--results", default=RESULTS, help="where the CSVs are [data/results]")

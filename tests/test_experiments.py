@@ -173,6 +173,7 @@ def test_dask_gives_the_rows_that_processes_give(tmp_path):
     (["sweep", "--set", "lr=fast"], ["lr=fast", "float"]),
     (["sweep", "--set", "kl=sideways"], ["kl", "sideways"]),
     (["sweep", "--set", "lr=1e-3", "--backend", "dask"], ["--scheduler"]),
+    (["sweep", "--set", "lr=1e-3", "--backend", "dask", "--scheduler", "nowhere"], ["nowhere"]),
     (["figure4", "--tasks", "reecher-hard"], ["reecher-hard", "reacher-hard"]),
     (["figure5", "--jobs", "0"], ["--jobs"]),
     (["figure7", "--tasks", "walker-run", "--seeds", "7"], ["walker-run-7", "distill"]),
