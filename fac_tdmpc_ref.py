@@ -741,12 +741,12 @@ class Distiller:
     def run(self, play=None):
         """Algorithm 1 from here to its end; yields the losses of each step.
 
-        play: takes the number of episodes that the student is to play, and returns their states
-        as `add` takes them; not needed without own episodes [D9]."""
+        play(first, count): the states, as `add` takes them, of episodes that the student plays, of
+        which it has played `first` before; not needed without own episodes [D9]."""
         while self.t < self.config.steps:
             quarter, played = 4 * self.t // self.config.steps, len(self.own) // EPISODE_STEPS
             if quarter * self.config.own_episodes > played:
-                self.add(play(quarter * self.config.own_episodes - played))
+                self.add(play(played, quarter * self.config.own_episodes - played))
             yield self.step()
 
     @property
@@ -1587,9 +1587,8 @@ def train_student(distiller, out, settings, playing, workers):
 
     A run that was cut off goes on from its checkpoint and ends as if it had not been. Returns
     (curve rows, seconds). playing, workers: how the student plays its own episodes [D9]."""
-    def play_own(count):
-        played = len(distiller.own) // EPISODE_STEPS
-        seeds = training_seeds(distiller.seed, "own episode", played, count)
+    def play_own(first, count):
+        seeds = training_seeds(distiller.seed, "own episode", first, count)
         return play(distiller.student, settings["task"], playing, seeds, workers,
                     "the student plays")[0]
 

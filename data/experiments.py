@@ -242,9 +242,8 @@ def distil(task, seed, case, settings):
     student, tap = distiller.student, case == "TAP"
     environment = DecodingEnvironment(task, distiller.vae) if tap else None
 
-    def play_own(count):
-        seeds = fac.training_seeds(seed, "own episode", len(distiller.own) // fac.EPISODE_STEPS,
-                                   count)
+    def play_own(first, count):
+        seeds = fac.training_seeds(seed, "own episode", first, count)
         return episodes(student, task, playing, seeds, environment)[0]
 
     every = -(-config.steps // own["evaluations"])

@@ -127,9 +127,10 @@ def test_a_share_of_the_states_is_the_students_own(replay):
         with fresh(replay, fac.dataclasses.replace(config, own_episodes=2)) as distiller:
             distiller.optimizer.t = quarters * 75
             asked = []
-            run = distiller.run(lambda n, asked=asked: asked.append(n) or own_episodes(*range(n)))
+            run = distiller.run(lambda first, count, asked=asked: asked.append((first, count))
+                                or own_episodes(*range(count)))
             next(run), next(run)
-            assert asked == [expected] * bool(expected)
+            assert asked == [(0, expected)] * bool(expected)
 
 
 def test_each_state_of_a_pool_is_learned_from_as_often_as_it_says(replay, monkeypatch):
