@@ -18,6 +18,7 @@ import io
 import itertools
 import json
 import os
+import re
 import sys
 import time
 from collections import defaultdict
@@ -281,32 +282,41 @@ FIGURE5 = {  # panel: {case: settings}; every panel holds the default
     "consistency": {"default": {}, "consistency": {}}}
 
 
+def distil_all(args, cases):
+    """A student for each seed and task, and each (case, settings) of cases(task)."""
+    budget = {k: getattr(args, k) for k in ("steps", "evaluations", "episodes", "samples",
+                                            "iterations")}
+    return run_all(args, distil, [make_run(task, seed, case, **{**budget, **settings})
+                                  for seed, task in itertools.product(args.seeds, args.tasks)
+                                  for case, settings in cases(task)])
+
+
 def command_figure4(args):
     """figure4: the methods of B.2 by Algorithm 1."""
-    return run_all(args, distil, [make_run(task, seed, case, **budget(args), **settings)
-                                  for seed, task in itertools.product(args.seeds, args.tasks)
-                                  for case, settings in FIGURE4.items()])
+    return distil_all(args, lambda task: FIGURE4.items())
 
 
 def command_figure5(args):
     """figure5: the choices of the loss."""
     cases = {case: settings for panel in FIGURE5.values() for case, settings in panel.items()}
-    return run_all(args, distil, [make_run(task, seed, case, **budget(args), **settings)
-                                  for seed, task in itertools.product(args.seeds, args.tasks)
-                                  for case, settings in cases.items()])
+    return distil_all(args, lambda task: cases.items())
 
 
 def command_figure13(args):
     """figure13: the number of agents."""
-    return run_all(args, distil, [make_run(task, seed, f"N = {n}", num_agents=n, **budget(args))
-                                  for seed, task in itertools.product(args.seeds, args.tasks)
-                                  for n in fac.divisors(fac.lookup_task(task)[3])])
+    return distil_all(args, lambda task: [(f"N = {n}", {"num_agents": n})
+                                          for n in fac.divisors(fac.lookup_task(task)[3])])
 
 
-def budget(args):
-    """What the runs of a figure of distillation have in common."""
-    return {k: getattr(args, k) for k in ("steps", "evaluations", "episodes", "samples",
-                                          "iterations")}
+def command_departures(args):
+    """departures: the README's differences in distillation one at a time, from ours towards the
+    paper's value, as the fields' metadata name them; but for the budget [D1]."""
+    cases = {"default": {}}
+    for field in dataclasses.fields(fac.DistillConfig):
+        tag = re.search(r"D\d+", field.metadata["help"])
+        if "paper" in field.metadata and tag[0] != "D1":
+            cases.setdefault(tag[0], {})[field.name] = field.metadata["paper"]
+    return distil_all(args, lambda task: cases.items())
 
 
 def command_sweep(args):
@@ -325,9 +335,7 @@ def command_sweep(args):
             raise fac.UserError(f"--set {text}: expected {kind.__name__}s") from None
     for settings in (points := [dict(point) for point in itertools.product(*grid)]):
         fac.DistillConfig(**{k: v for k, v in settings.items() if k != "num_agents"})
-    return run_all(args, distil, [make_run(task, seed, "sweep", **{**budget(args), **settings})
-                                  for seed, task in itertools.product(args.seeds, args.tasks)
-                                  for settings in points])
+    return distil_all(args, lambda task: [("sweep", settings) for settings in points])
 
 # ------------------------------------------------------------ Figures 7 and 8: planning
 
@@ -637,7 +645,8 @@ show. Returns: mean ± deviation over seeds (their number); every run's settings
 
 """
 REPORTS = {"figure4": report_curves, "figure5": report_curves, "figure7": report_figure7,
-           "figure8": report_figure8, "figure12": report_curves, "figure13": report_curves}
+           "figure8": report_figure8, "figure12": report_curves, "figure13": report_curves,
+           "departures": report_curves}
 
 
 def command_report(args):
@@ -649,7 +658,8 @@ def command_report(args):
         rows = finished(read_rows(results / f"{name}.csv"))
         if rows:
             result[name], table = make(name, rows, figures)
-            text.append(f"## Figure {name[6:]}\n\n{table}\n![]({figures_from}/{name}.png)\n")
+            title = name.replace("figure", "Figure ").capitalize()
+            text.append(f"## {title}\n\n{table}\n![]({figures_from}/{name}.png)\n")
     fac.need(result, f"{results}: no runs there; make some, e.g. 'python data/experiments.py "
              f"figure4'")
     with fac.atomic_file(results / "report.md", "w", encoding="utf-8") as file:
@@ -709,6 +719,9 @@ def make_parser():
     add_runs("figure5", command_figure5, "Section 5.3: KL against MSE, the perturbations' "
              "deviation, the student's temperature, a consistency loss.", walkers, steps=steps,
              evaluations=4)
+    add_runs("departures", command_departures, "The differences [D2] to [D9] one at a time, "
+             "towards the paper's values.", ["reacher-hard", "walker-walk"], steps=steps,
+             evaluations=1)
     for name, run, help in (
             ("figure7", command_figure7, "Section 5.4: samples and iterations, expert and student: "
              "returns, then milliseconds (keep the machine quiet for these)."),

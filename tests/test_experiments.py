@@ -1,6 +1,7 @@
 """data/experiments.py: the paper's tables as users run them, small."""
 import dataclasses
 import importlib.util
+import json
 import os
 import signal
 import subprocess
@@ -335,6 +336,35 @@ def test_a_disturbed_robot():
     assert not np.allclose(step("1.5", full), step("0.5", full))
     assert not np.allclose(step("noise", full), step("1.5", 0 * full))
     np.testing.assert_array_equal(step("noise", full), step("noise", 0 * full))  # unheard
+
+
+def test_figures_7_and_8_plan_with_both_models(tmp_path, monkeypatch):
+    pytest.importorskip("joblib")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(experiments, "BUDGETS", [(8, 1), (4, 1)])
+    fac.save_model("runs/reacher-hard-0/student.npz", random_model(), {"kind": "student"})
+    flags = ["--tasks", "reacher-hard", "--seeds", "0", "--jobs", "1", "--episodes", "1"]
+    for _ in range(2):  # nothing is missing the second time
+        assert experiments.main(["figure7", *flags, "--rounds", "2", "--out", "7.csv"]) == 0
+        rows = experiments.read_rows("7.csv")
+        assert len(rows) == 8 and [bool(row["ms"]) for row in rows] == [False] * 4 + [True] * 4
+    assert {row["case"] for row in rows} == {"expert", "student"}
+    seen = []  # who plays is the same for figure 8
+    monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: seen.extend(runs))
+    assert experiments.main(["figure8", *flags]) == 0
+    assert len(seen) == 2 * (1 + 3 * 3)
+
+
+def test_departures_are_those_that_the_settings_name(monkeypatch):
+    seen = []
+    monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: seen.extend(runs))
+    assert experiments.main(["departures", "--tasks", "walker-run", "--seeds", "3"]) == 0
+    found = {run["case"]: json.loads(run["settings"]) for run in seen}
+    assert set(found) == {"default", "D2", "D3", "D5", "D7", "D8", "D9"}
+    own = set(found["default"])
+    assert {k: v for k, v in found["D8"].items() if k not in own} == {
+        "noise_std": 0.5, "noise_std_min": 0.5, "clip_actions": False}
+    assert found["D2"]["kl"] == "reverse" and found["D9"]["own_episodes"] == 0
 
 
 def write_rows(path, runs):
