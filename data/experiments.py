@@ -241,7 +241,10 @@ def distil(task, seed, case, settings):
                                     **budget})
     playing = dataclasses.replace(planning, samples=64, iterations=3)
     student, tap = distiller.student, case == "TAP"
-    environment = DecodingEnvironment(task, distiller.vae) if tap else None
+    environment = None
+    if tap:
+        from tap import DecodingEnvironment
+        environment = DecodingEnvironment(task, expert, distiller.vae)
 
     def play_own(first, count):
         seeds = fac.training_seeds(seed, "own episode", first, count)
@@ -259,17 +262,6 @@ def distil(task, seed, case, settings):
                 q, g = fac.rank_correlation(distiller, 256, planning.discount)
                 row.update(rank_q=float(q[0]), rank_return=float(g[-1]))
             yield {"step": distiller.t, **row}
-
-
-class DecodingEnvironment(fac.Environment):
-    """A task for TAP's planner: its actions are latent ones."""
-
-    def __init__(self, task, vae):
-        super().__init__(task)
-        self._vae = vae
-
-    def step(self, action):
-        return super().step(self._vae.decode(action))
 
 
 FIGURE4 = {"Fac-TDMPC": {}, "100% TD-MPC": {"num_agents": 1}, "10% TD-MPC": {}, "TAP": {}}

@@ -272,15 +272,15 @@ def test_consistency_vanishes_where_the_student_follows_the_expert():
 
 
 def small_vae(dtype=np.float64):
-    return tap.ActionVAE(3, np.random.default_rng(0), 8, dtype)
+    return tap.ActionVAE(4, 3, np.random.default_rng(0), 8, dtype)
 
 
 def test_gradients_of_the_action_vae():
     vae, rng = small_vae(), np.random.default_rng(2)
-    actions, noise = rng.uniform(-1, 1, (3, 5)), rng.standard_normal((2, 5))
+    x, noise = rng.uniform(-1, 1, (7, 5)), rng.standard_normal((2, 5))
     grads = {k: np.zeros_like(v) for k, v in vae.params.items()}
-    vae.loss(actions, noise, 0.3, grads)
-    for numeric, exact in slopes(lambda: vae.loss(actions, noise, 0.3), vae.params, grads):
+    vae.loss(x, noise, 0.3, grads)
+    for numeric, exact in slopes(lambda: vae.loss(x, noise, 0.3), vae.params, grads):
         np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-9)
 
 
@@ -288,16 +288,17 @@ def test_the_action_vae_against_pytorch():
     torch = pytest.importorskip("torch")
     from torch_learner import network
     vae, rng = small_vae(), np.random.default_rng(2)
-    actions, noise = rng.uniform(-1, 1, (3, 5)), rng.standard_normal((2, 5))
+    x, noise = rng.uniform(-1, 1, (7, 5)), rng.standard_normal((2, 5))
     grads = {k: np.zeros_like(v) for k, v in vae.params.items()}
-    loss = vae.loss(actions, noise, 0.3, grads)
+    loss = vae.loss(x, noise, 0.3, grads)
     params = {k: torch.tensor(v, requires_grad=True) for k, v in vae.params.items()}
-    a = torch.tensor(actions.T)
-    mu, log_var = network(fac.MLP, params, "encode", a[None])[0].chunk(2, -1)
+    x = torch.tensor(x.T)
+    mu, log_var = network(fac.MLP, params, "encode", x[None])[0].chunk(2, -1)
     posterior = torch.distributions.Normal(mu, (log_var / 2).exp())
     prior = torch.distributions.Normal(torch.zeros(()), torch.ones(()))
     u = mu + posterior.stddev * torch.tensor(noise.T)
-    error = (network(fac.MLP, params, "decode", u[None])[0] - a).square().sum()
+    back = network(fac.MLP, params, "decode", torch.cat([x[:, :4], u], 1)[None])[0]
+    error = (back - x[:, 4:]).square().sum()
     total = (error + 0.3 * torch.distributions.kl_divergence(posterior, prior).sum()) / 5
     total.backward()
     assert np.isclose(loss, total.item())
@@ -306,20 +307,21 @@ def test_the_action_vae_against_pytorch():
 
 
 def test_the_action_vae_finds_a_plane():
-    """Actions of a plane in four dimensions come back; latent ones stay in [-1, 1]."""
+    """Actions in a plane through a point that the state tells come back from two numbers."""
     rng = np.random.default_rng(0)
     plane = rng.standard_normal((4, 2)) / 3
 
     def draw(batch):
-        return (plane @ rng.uniform(-1, 1, (2, batch))).astype(np.float32)
+        s = rng.uniform(-0.5, 0.5, (4, batch))
+        return np.concatenate([s, s + plane @ rng.uniform(-1, 1, (2, batch))]).astype(np.float32)
 
-    vae = tap.ActionVAE(4, rng)
-    vae.fit(draw, rng, 600, beta=1e-3)
-    actions = draw(64)
-    u = vae.encode(actions)
+    vae = tap.ActionVAE(4, 4, rng)
+    vae.fit(draw, rng, 800, beta=1e-3)
+    x = draw(64)
+    u = vae.encode(x)
     assert u.shape == (2, 64) and np.abs(u).max() <= 1
-    back = np.stack([vae.decode(x) for x in u.T], 1)
-    assert ((back - actions) ** 2).mean() < 0.05 * actions.var()
+    back = np.stack([vae.decode(x[:4, i:i + 1], u[:, i]) for i in range(64)], 1)
+    assert ((back - x[4:]) ** 2).mean() < 0.05 * x[4:].var()
 
 
 def test_a_disturbed_robot():
