@@ -22,6 +22,7 @@ import re
 import sys
 import time
 from collections import defaultdict
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
 import numpy as np
@@ -49,10 +50,10 @@ def make_run(task, seed, case, **settings):
 
 def read_rows(path):
     """A CSV's rows, dicts of strings; without a line that a kill cut off."""
-    if not Path(path).exists():
+    text = Path(path).read_text(encoding="utf-8") if Path(path).exists() else ""
+    if "\n" not in text:  # a kill before the first row
         return []
-    head, *lines = [next(csv.reader([line]), []) for line in  # one by one: a cut one has no end
-                    Path(path).read_text(encoding="utf-8").splitlines() or [""]]
+    head, *lines = [next(csv.reader([line]), []) for line in text.splitlines()]  # a cut one alone
     fac.need(tuple(head) == ROW, f"{path}: expected the columns {','.join(ROW)}, found "
              f"{','.join(head)}; choose another --out")
     return [dict(zip(ROW, line)) for line in lines if len(line) == len(ROW)]
@@ -64,12 +65,13 @@ def append_rows(path, rows):
     writer = csv.DictWriter(text, ROW)
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "a+b") as file:
-        file.seek(0, os.SEEK_END)
-        if not file.tell():
+        file.seek(0)
+        before = file.read()
+        if b"\n" not in before:
+            file.truncate(0)
             writer.writeheader()
-        else:
-            file.seek(-1, os.SEEK_END)
-            text.write("" if file.read() == b"\n" else "\n")  # ends a line that was cut off
+        elif not before.endswith(b"\n"):
+            text.write("\n")  # ends a line that was cut off
         writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()}
                          for row in rows)
         file.write(text.getvalue().encode())
@@ -83,15 +85,16 @@ def finished(rows):
     return {key: found for key, found in runs.items() if any(row["minutes"] for row in found)}
 
 
-def attempt(function, run):
-    """A run's rows; one that fails is a row with its error."""
-    os.environ["TQDM_DISABLE"] = "1"  # a worker's own bars
+def attempt(function, run, home):
+    """A run's rows; one that fails is a row with its error. home: the process that waits."""
+    if home != os.getpid():
+        os.environ["TQDM_DISABLE"] = "1"  # a worker's own bars
     began = time.time()
     with fac.one_thread():
         try:
             found = list(function(run["task"], int(run["seed"]), run["case"],
                                   json.loads(run["settings"])))
-            found[-1]["minutes"] = (time.time() - began) / 60
+            found[-1].setdefault("minutes", (time.time() - began) / 60)
         except Exception as error:
             found = [{"error": f"{type(error).__name__}: {' '.join(str(error).split())}"}]
     return [{**run, **row} for row in found]
@@ -108,15 +111,22 @@ def run_all(args, function, runs):
         fac.lookup_task(task)
     path = Path(args.out or RESULTS / f"{args.command}.csv")
     done = finished(read_rows(path))
+    runs = list({tuple(run.values()): run for run in runs}.values())
     todo = [run for run in runs if tuple(run.values()) not in done]
     failed, where = [], connect(args)
     with fac.progress(args.command, len(runs), "run", len(runs) - len(todo)) as bar, \
             joblib.parallel_config(**where):
-        parallel = joblib.Parallel(args.jobs, return_as="generator_unordered")
-        for rows in parallel(joblib.delayed(attempt)(function, run) for run in todo):
-            append_rows(path, rows)
-            failed += [row["error"] for row in rows if row.get("error")]
-            bar.update()
+        parallel = joblib.Parallel(args.jobs, return_as="generator_unordered", batch_size=1,
+                                   pre_dispatch="n_jobs")  # a kill leaves no queue behind
+        try:
+            for rows in parallel(joblib.delayed(attempt)(function, run, os.getpid())
+                                 for run in todo):
+                append_rows(path, rows)
+                failed += [row["error"] for row in rows if row.get("error")]
+                bar.update()
+        except BrokenExecutor as error:
+            raise fac.UserError(f"a worker process died ({' '.join(str(error).split())[:120]}); "
+                                "the same command makes what is missing") from None
     for error in failed:
         print(f"failed: {error}", file=sys.stderr)
     print(f"{path}: {len(runs)} runs, {len(todo)} of them now, {len(failed)} failed")
@@ -229,7 +239,9 @@ def distiller_of(case):
 
 def distil(task, seed, case, settings):
     """Distil a student; a row at each evaluation. settings: of DistillConfig, and `num_agents`,
-    `evaluations` on the way, of so many `episodes`, planned with `samples` and `iterations`."""
+    `evaluations` on the way, of so many `episodes`, planned with `samples` and `iterations`;
+    `data`: a checksum, which tells apart what it is learned from."""
+    settings.pop("data", None)
     own = {k: settings.pop(k, v) for k, v in (("num_agents", None), ("evaluations", 1),
                                               ("episodes", 10))}
     budget = {k: settings.pop(k) for k in ("samples", "iterations") if k in settings}
@@ -278,9 +290,18 @@ def distil_all(args, cases):
     """A student for each seed and task, and each (case, settings) of cases(task)."""
     budget = {k: getattr(args, k) for k in ("steps", "evaluations", "episodes", "samples",
                                             "iterations")}
-    return run_all(args, distil, [make_run(task, seed, case, **{**budget, **settings})
-                                  for seed, task in itertools.product(args.seeds, args.tasks)
-                                  for case, settings in cases(task)])
+    data = {task: data_checksum(task) for task in args.tasks}
+    return run_all(args, distil, [
+        make_run(task, seed, case, data=data[task], **{**budget, **settings})
+        for seed, task in itertools.product(args.seeds, args.tasks)
+        for case, settings in cases(task)])
+
+
+def data_checksum(task):
+    """Of a task's expert and replay."""
+    expert, _ = fac.load_model(fac.data_file(task, "expert.npz"))
+    replay = fac.Replay(fac.data_file(task, "replay.npz"))
+    return fac.checksum([*expert.params.values(), replay.observation, replay.action])
 
 
 def command_figure4(args):
@@ -308,7 +329,9 @@ def command_departures(args):
         tag = re.search(r"D\d+", field.metadata["help"])
         if "paper" in field.metadata and tag[0] != "D1":
             cases.setdefault(tag[0], {})[field.name] = field.metadata["paper"]
-    return distil_all(args, lambda task: cases.items())
+    return distil_all(args, lambda task: [  # new targets are reacher's alone
+        (case, settings) for case, settings in cases.items()
+        if case != "D7" or task.startswith("reacher")])
 
 
 def command_sweep(args):
@@ -321,6 +344,7 @@ def command_sweep(args):
                  f"SETTING=VALUE[,VALUE ...] with one of num_agents, {', '.join(known)}")
         kind = type(known[name].default) if name in known else int
         read = {bool: lambda x: {"true": True, "false": False}[x.lower()]}.get(kind, kind)
+        fac.need(name not in dict(chain[0] for chain in grid), f"--set: {name} is there twice")
         try:
             grid.append([(name, read(value)) for value in values.split(",")])
         except (ValueError, KeyError):
@@ -328,6 +352,7 @@ def command_sweep(args):
     for settings in (points := [dict(point) for point in itertools.product(*grid)]):
         fac.DistillConfig(**{k: v for k, v in settings.items() if k != "num_agents"})
     return distil_all(args, lambda task: [("sweep", settings) for settings in points])
+
 
 # ------------------------------------------------------------ Figures 7 and 8: planning
 
@@ -348,7 +373,7 @@ def load(task, seed, case, students):
 def planning_runs(args, variants):
     """A run for each variant (a dict) of planning with each model of each task."""
     models = [("expert", 0), *(("student", seed) for seed in args.seeds)]
-    return [make_run(task, seed, case, students=args.students, episodes=args.episodes,
+    return [make_run(task, seed, case, episodes=args.episodes,
                      weights=fac.checksum(load(task, seed, case, args.students)[0].params.values()),
                      **variant)
             for task in args.tasks for case, seed in models for variant in variants(task)]
@@ -360,10 +385,10 @@ def planning_for(header, about):
     return fac.PlannerConfig(**fac.made_for(header, "model"), **budget)
 
 
-def plan_with(task, seed, case, settings):
+def plan_with(task, seed, case, settings, students):
     """The returns of a model: with its file's planning but for `samples` and `iterations`, on a
-    robot that `joint` and `kind` disturb."""
-    model, header = load(task, seed, case, settings["students"])
+    robot that `joint` and `kind` disturb. students: a folder, see `load`."""
+    model, header = load(task, seed, case, students)
     planning = planning_for(header, settings)
     environment = None
     if settings.get("kind"):
@@ -379,8 +404,9 @@ class DisturbedEnvironment(fac.Environment):
         super().__init__(task)
         self._joint = joint if kind == "noise" else None
         self._rng = fac.stream(joint, "disturbance")
-        if self._joint is None:
-            self.env.physics.model.actuator_gear[joint] *= float(kind)
+        if self._joint is None:  # what the motor gives for a control, of a servo's stiffness, too
+            self.env.physics.model.actuator_gainprm[joint] *= float(kind)
+            self.env.physics.model.actuator_biasprm[joint] *= float(kind)
 
     def step(self, action):
         if self._joint is not None:
@@ -392,34 +418,34 @@ class DisturbedEnvironment(fac.Environment):
 def command_figure7(args):
     """figure7: samples and iterations; returns first, then milliseconds, nothing else running."""
     runs = planning_runs(args, lambda task: [{"samples": s, "iterations": i} for s, i in BUDGETS])
-    result = run_all(args, plan_with, runs)
-    rows = read_rows(result["out"])
-    timed = {tuple(row[k] for k in KEY) for row in rows if row["ms"]}
-    for task in args.tasks:
-        todo = [run for run in runs if run["task"] == task and tuple(run.values()) not in timed]
+    result = run_all(args, functools.partial(plan_with, students=args.students), runs)
+    timed = {tuple(row[k] for k in KEY) for row in read_rows(result["out"]) if row["ms"]}
+    for task, (samples, iterations) in itertools.product(args.tasks, BUDGETS):
+        todo = [run for run in runs if run["task"] == task and tuple(run.values()) not in timed
+                and planning_for({}, json.loads(run["settings"])).samples == samples
+                and planning_for({}, json.loads(run["settings"])).iterations == iterations]
         if todo:
-            append_rows(Path(result["out"]), time_runs(task, todo, args.rounds))
+            append_rows(Path(result["out"]), time_runs(todo, args.students, args.rounds))
     return result
 
 
-def time_runs(task, runs, rounds):
-    """Rows with milliseconds of runs' decisions: in one process, and students' with a process on
-    each core. All take turns."""
-    models, calls = {}, []
+def time_runs(runs, students, rounds):
+    """Rows with milliseconds of the decisions of runs of one budget, which take turns: in one
+    process, and students' with a process on each core."""
+    calls = []
     with contextlib.ExitStack() as stack:
         for run in runs:
-            about, key = json.loads(run["settings"]), (run["case"], run["seed"])
-            if key not in models:
-                models[key] = load(task, run["seed"], run["case"], about["students"])
-            model, header = models[key]
-            planning = planning_for(header, about)
+            model, header = load(run["task"], run["seed"], run["case"], students)
+            planning = planning_for(header, json.loads(run["settings"]))
             obs = np.random.default_rng(0).standard_normal(model.config.dim_obs, fac.F32)
-            for workers in (0, fac.useful_workers(model.config.num_agents)):
+            for workers in {0, fac.useful_workers(model.config.num_agents)}:
                 planner = stack.enter_context(fac.Planner(model, planning, workers=workers))
-                calls.append(functools.partial(planner.act, obs))
-        ms = 1e3 * np.median(fac.interleaved_seconds(calls, rounds, f"{task}: timing"), 0)
-    return [{**run, "ms": float(alone), "ms_workers": float(parallel)}
-            for run, alone, parallel in zip(runs, ms[::2], ms[1::2])]
+                calls.append((run["case"], run["seed"], workers > 0, functools.partial(planner.act,
+                                                                                       obs)))
+        found = fac.interleaved_seconds([call[-1] for call in calls], rounds, "timing")
+    ms = {call[:3]: 1e3 * float(x) for call, x in zip(calls, np.median(found, 0))}
+    return [{**run, "ms": alone, "ms_workers": ms.get((run["case"], run["seed"], True), alone)}
+            for run in runs for alone in [ms[run["case"], run["seed"], False]]]
 
 
 def command_figure8(args):
@@ -428,33 +454,34 @@ def command_figure8(args):
         joints = range(fac.lookup_task(task)[3])
         return [{}, *({"joint": j, "kind": kind} for j in joints
                       for kind in ("noise", "0.5", "1.5"))]
-    return run_all(args, plan_with, planning_runs(args, variants))
+    return run_all(args, functools.partial(plan_with, students=args.students),
+                   planning_runs(args, variants))
 
 
 # ---------------------------------------------------------- Figure 12: distilling on the way
 
 def follow(task, seed, case, settings):
-    """train_expert.py --student fac: rows of the expert's and the student's returns."""
+    """train_expert.py --student fac: rows of the student's and the expert's returns."""
     import train_expert
-    out = settings["out"]
-    status = train_expert.main(["--task", task, "--seed", str(seed), "--student", "fac", "--out",
-                                out, "--steps", str(settings["decisions"]), "--episodes", "0",
-                                "--evaluate-episodes", str(settings["episodes"]),
-                                "--workers", "1"])
-    fac.need(status == 0, f"train_expert.py --task {task} ended with status {status}")
+    out = f"runs/online-{task}-{seed}-{settings['decisions']}-{settings['episodes']}"
+    args = train_expert.make_parser().parse_args([
+        "--task", task, "--seed", str(seed), "--student", "fac", "--out", out, "--workers", "1",
+        "--steps", str(settings["decisions"]), "--episodes", "0",
+        "--evaluate-episodes", str(settings["episodes"])])
+    train_expert.train(args)
     with open(Path(out) / "curve.csv", newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            if row["eval_student"]:
-                yield {"step": row["decisions"], "return_mean": float(row["eval_student"]),
-                       "expert_mean": float(row["eval_expert"])}
+        rows = [row for row in csv.DictReader(file) if row["eval_student"]]
+    for row in rows:
+        yield {"step": row["decisions"], "return_mean": float(row["eval_student"]),
+               "expert_mean": float(row["eval_expert"]), "minutes": float(row["seconds"]) / 60}
 
 
 def command_figure12(args):
     """figure12: online distillation (C.1)."""
     return run_all(args, follow, [
-        make_run(task, seed, "online", decisions=args.decisions, episodes=args.episodes,
-                 out=f"runs/online-{task}-{seed}")
+        make_run(task, seed, "online", decisions=args.decisions, episodes=args.episodes)
         for seed, task in itertools.product(args.seeds, args.tasks)])
+
 
 # ------------------------------------------------------------------ report: tables, pictures
 
@@ -469,27 +496,47 @@ AUTHORS = {
 METHODS = ("10% TD-MPC", "TAP", "100% TD-MPC", "Fac-TDMPC")
 
 
+CASES = [*METHODS, *(case for panel in FIGURE5.values() for case in panel)]
+
+
+def settled(path, but=()):
+    """A CSV's finished runs; UserError if those of one task, seed and case were made with other
+    settings than `but`: they don't belong in one figure."""
+    rows, seen = finished(read_rows(path)), {}
+    for task, seed, case, settings in rows:
+        about = {k: v for k, v in json.loads(settings).items() if k not in but}
+        other = seen.setdefault((task, seed, case), about)
+        fac.need(other == about, f"{path}: {case} of {task}, seed {seed}, was made with {other} "
+                 f"and with {about}; delete the rows that are of no use")
+    return rows
+
+
 def curves(rows, column="return_mean"):
-    """{task: {case: {step: [value of each seed]}}} of finished runs."""
+    """{task: {case: {step: [value of each seed]}}} of finished runs, cases always in one order."""
     found = {}
+    for task, _, case, _ in sorted(rows, key=lambda key: (
+            CASES.index(key[2]) if key[2] in CASES else -1, len(key[2]), key)):
+        found.setdefault(task, {}).setdefault(case, {})
     for (task, _, case, _), own in rows.items():
-        for step, row in {float(r["step"]): r for r in own if r["step"]}.items():
-            found.setdefault(task, {}).setdefault(case, {}).setdefault(step, []).append(
-                float(row[column]))
+        for step, row in {float(r["step"]): r for r in own if r["step"] and r[column]}.items():
+            found[task][case].setdefault(step, []).append(float(row[column]))
     return found
 
 
-def last(curve):
-    """Mean and deviation over seeds, and their number, where a curve ends."""
+def last(curve, ranks):
+    """Mean and deviation over seeds, and their number, where a curve ends; the rank correlation
+    of G there, if it was measured."""
     values = curve[max(curve)]
-    return {"mean": float(np.mean(values)), "std": float(np.std(values)), "seeds": len(values)}
+    found = {"mean": float(np.mean(values)), "std": float(np.std(values)), "seeds": len(values)}
+    return {**found, "rank_return": float(np.mean(ranks[max(ranks)]))} if ranks else found
 
 
 def draw_lines(path, panels, xlabel, **axes):
     """A panel each {title: ({label: {x: [values]}}, level or None)}: mean and band over seeds;
     the level, an expert's, is a line across."""
     plt = fac.pyplot()
-    columns = min(4, len(panels))
+    labels = list(dict.fromkeys(label for lines, _ in panels.values() for label in lines))
+    cycle, columns = list(plt.rcParams["axes.prop_cycle"]), min(4, len(panels))
     figure, grid = plt.subplots(-(-len(panels) // columns), columns, squeeze=False,
                                 figsize=(3.6 * columns, 3.2 * -(-len(panels) // columns)),
                                 layout="constrained")
@@ -499,10 +546,11 @@ def draw_lines(path, panels, xlabel, **axes):
             ax.remove()
             continue
         for label, points in lines.items():
+            style = cycle[labels.index(label) % len(cycle)]
             x = sorted(points)
             mean, std = (np.array([f(points[v]) for v in x]) for f in (np.mean, np.std))
-            (line,) = ax.plot(x, mean, marker=".", label=label)
-            ax.fill_between(x, mean - std, mean + std, color=line.get_color(), alpha=0.15)
+            ax.plot(x, mean, marker=".", label=label, **style)
+            ax.fill_between(x, mean - std, mean + std, color=style["color"], alpha=0.15)
         if level is not None:
             ax.axhline(level, color="black", linewidth=0.8, linestyle=(0, (1, 3)), label="expert")
         ax.set(title=title, xlabel=xlabel, ylabel="episode return", ylim=(0, None), **axes)
@@ -510,10 +558,12 @@ def draw_lines(path, panels, xlabel, **axes):
     fac.save_figure(path, figure)
 
 
-def expert_level(task):
-    """The mean of an expert's recorded returns, whichever setting they are of; None: no record."""
-    returns = list(fac.read_records(fac.DATA / task / "expert.npz").values())
-    return float(np.mean(returns[0])) if returns else None
+def expert_level(task, rows):
+    """The mean of an expert's recorded returns, planned as the runs were; None: no record."""
+    about = next((json.loads(settings) for own, _, _, settings in rows if own == task), {})
+    expert, header = fac.load_model(path := fac.data_file(task, "expert.npz"))
+    returns = fac.read_records(path).get(fac.record_key(expert, planning_for(header, about), 0), [])
+    return float(np.mean(returns[:about.get("episodes")])) if returns else None
 
 
 def markdown(heads, rows):
@@ -523,40 +573,63 @@ def markdown(heads, rows):
 
 
 def cell(found):
-    """mean ± deviation (seeds)."""
-    return f"{found['mean']:.0f} ± {found['std']:.0f} ({found['seeds']})" if found else "-"
+    """mean ± deviation (seeds), rank correlation of G."""
+    if not found:
+        return "-"
+    rank = f", {found['rank_return']:.2f}" if "rank_return" in found else ""
+    return f"{found['mean']:.0f} ± {found['std']:.0f} ({found['seeds']}){rank}"
 
 
-def report_curves(name, rows, figures):
+def report_curves(name, path, figures):
     """Figures 4, 5, 12 and 13: curves; result {task: {case: last}} and Markdown."""
-    found = curves(rows)
+    rows = settled(path)
+    found, ranks = curves(rows), curves(rows, "rank_return")
+    levels = {task: None if name == "figure12" else expert_level(task, rows) for task in found}
     if name == "figure12":
         for task, cases in curves(rows, "expert_mean").items():
             found[task] = {"student": found[task]["online"], "expert": cases["online"]}
+    panels = {task: (cases, levels[task]) for task, cases in found.items()}
     if name == "figure5":
         panels = {f"{task}: {panel}": ({case: cases[case] for case in own if case in cases},
-                                       expert_level(task))
+                                       levels[task])
                   for task, cases in found.items() for panel, own in FIGURE5.items()}
-    else:
-        panels = {task: (cases, None if name == "figure12" else expert_level(task))
-                  for task, cases in found.items()}
     draw_lines(figures / f"{name}.png", panels,
                "decisions" if name == "figure12" else "gradient step")
-    result = {task: {case: last(curve) for case, curve in cases.items()}
+    result = {task: {case: last(curve, ranks[task].get(case)) for case, curve in cases.items()}
               for task, cases in found.items()}
     cases = list(dict.fromkeys(case for found in result.values() for case in found))
+    heads, table = ["", *cases, "expert"], [
+        [task, *(cell(found.get(case)) for case in cases),
+         "-" if levels[task] is None else f"{levels[task]:.0f}"] for task, found in result.items()]
     if name == "figure4":
-        cases = [case for case in METHODS if case in cases]
-    table = [(task, *(cell(found.get(case)) for case in cases),
-              *([" / ".join(map(str, AUTHORS[task]))] if name == "figure4" else []))
-             for task, found in result.items()]
-    heads = ["", *cases] + (["authors: " + " / ".join(METHODS)] if name == "figure4" else [])
+        heads.append("authors: " + " / ".join(METHODS))
+        for row in table:
+            row.append(" / ".join(map(str, AUTHORS[row[0]])))
+    for task, level in levels.items():
+        result[task].update({"expert_recorded": level} if level is not None else {})
+    if name == "figure12":
+        heads[-1:] = ["ratio", "lag to 50 / 75 / 90%, decisions, each seed"]
+        for row in table:
+            ratio, lags = follow_up(rows, row[0])
+            result[row[0]].update(ratio=ratio, lag=lags)
+            row[-1:] = [f"{ratio:.2f}", "; ".join(" / ".join(map(str, x)) for x in lags)]
     return result, markdown(heads, table)
 
 
-def report_figure7(_, rows, figures):
+def follow_up(rows, task):
+    """Figure 12 in numbers: final return of the student over the expert's, mean over seeds; lags
+    to 50, 75 and 90% of each seed."""
+    from train_expert import lag
+    runs = [[{"decisions": int(r["step"]), "eval_student": float(r["return_mean"]),
+              "eval_expert": float(r["expert_mean"])} for r in own if r["step"]]
+            for (t, *_), own in rows.items() if t == task]
+    return (float(np.mean([run[-1]["eval_student"] / run[-1]["eval_expert"] for run in runs])),
+            [[lag(run, p) for p in (0.5, 0.75, 0.9)] for run in runs])
+
+
+def report_figure7(_, path, figures):
     """Figure 7: the smallest budget, by milliseconds, that keeps 0.95 of the full one's return."""
-    cells = {}
+    rows, cells = settled(path, ("samples", "iterations")), {}
     for (task, _, case, settings), own in rows.items():
         about = json.loads(settings)
         into = cells.setdefault(task, {}).setdefault(case, {}).setdefault(
@@ -597,14 +670,14 @@ def report_figure7(_, rows, figures):
                             table)
 
 
-def report_figure8(_, rows, figures):
+def report_figure8(_, path, figures):
     """Figure 8: bars of the return with each action dimension disturbed; means over these."""
-    cells = {}
+    rows, cells = settled(path, ("joint", "kind")), {}
     for (task, _, case, settings), own in rows.items():
         about = json.loads(settings)
         cells.setdefault(task, {}).setdefault(case, {}).setdefault(
             (about.get("kind", "none"), about.get("joint", 0)), []).append(
-            float(own[-1]["return_mean"]))
+            float(next(row["return_mean"] for row in reversed(own) if row["return_mean"])))
     plt, kinds = fac.pyplot(), ("noise", "0.5", "1.5")
     figure, grid = plt.subplots(len(cells), 3, squeeze=False, layout="constrained",
                                 figsize=(11, 2.6 * len(cells)), sharey="row")
@@ -613,7 +686,7 @@ def report_figure8(_, rows, figures):
         for ax, kind in zip(row, kinds):
             for i, (case, values) in enumerate(sorted(cases.items())):
                 joints = sorted(j for k, j in values if k == kind)
-                ax.bar(np.arange(len(joints)) + 0.4 * i - 0.2,
+                ax.bar(np.array(joints) + 0.4 * i - 0.2,
                        [np.mean(values[kind, j]) for j in joints], 0.38, label=case,
                        color=f"C{i}", hatch=("", "//")[i % 2], edgecolor="black")
                 if ("none", 0) in values:
@@ -621,10 +694,13 @@ def report_figure8(_, rows, figures):
             what = "one action is noise" if kind == "noise" else f"one motor x {kind}"
             ax.set(title=f"{task}: {what}", xlabel="action dimension", ylabel="episode return")
         row[0].legend()
-        result[task] = {case: {kind: float(np.mean([np.mean(v) for (k, _), v in values.items()
-                                                    if k == kind] or [np.nan]))
-                               for kind in ("none", *kinds)} for case, values in cases.items()}
-        table += [(task, case, *(f"{x:.0f}" for x in found.values()))
+        both = set.intersection(*(set(values) for values in cases.values()))  # measured for all
+        result[task] = {case: {kind: float(np.mean([np.mean(values[k, j]) for k, j in both
+                                                    if k == kind]))
+                               for kind in ("none", *kinds) if kind in dict(both)}
+                        for case, values in cases.items()}
+        table += [(task, case, *(f"{found[kind]:.0f}" if kind in found else "-"
+                                 for kind in ("none", *kinds)))
                   for case, found in sorted(result[task].items())]
     fac.save_figure(figures / "figure8.png", figure)
     return result, markdown(("", "", "undisturbed", *kinds), table)
@@ -633,7 +709,9 @@ def report_figure8(_, rows, figures):
 REPORT_HEAD = """# The paper's figures, here
 
 Written by `python data/experiments.py report` from the CSVs beside it; README.md says what they
-show. Returns: mean ± deviation over seeds (their number); every run's settings are in its CSV.
+show. Returns: mean ± deviation over seeds (their number), then the rank correlation of G; every
+run's settings are in its CSV. '10% TD-MPC' has hidden layers of 66 (B.2), which with Table 2's
+latents of 50 is 3% of the weights; six factored agents have 26%.
 
 """
 REPORTS = {"figure4": report_curves, "figure5": report_curves, "figure7": report_figure7,
@@ -647,9 +725,8 @@ def command_report(args):
     figures_from = os.path.relpath(figures, results)
     fac.pyplot()
     for name, make in REPORTS.items():
-        rows = finished(read_rows(results / f"{name}.csv"))
-        if rows:
-            result[name], table = make(name, rows, figures)
+        if finished(read_rows(results / f"{name}.csv")):
+            result[name], table = make(name, results / f"{name}.csv", figures)
             title = name.replace("figure", "Figure ").capitalize()
             text.append(f"## {title}\n\n{table}\n![]({figures_from}/{name}.png)\n")
     fac.need(result, f"{results}: no runs there; make some, e.g. 'python data/experiments.py "
@@ -733,8 +810,8 @@ def make_parser():
     sub.add_argument("--set", nargs="+", required=True, metavar="SETTING=VALUE,...",
                      help="e.g. lr=1e-3,3e-4 batch-size=16,32; see distill --help")
     sub.add_argument("--backend", choices=("loky", "dask"), default="loky", help="processes of "
-                     "this machine, or a cluster whose workers have this repository's data/ on "
-                     "their PYTHONPATH [loky]")
+                     "this machine, or a cluster whose workers (--nthreads 1) have this "
+                     "repository's data/ on their PYTHONPATH [loky]")
     sub.add_argument("--scheduler", help="the cluster's, tcp://HOST:PORT")
     sub = fac.add_command(commands, "report", command_report, "Tables and figures from the CSVs: "
                           "data/results/report.md, data/figures/figure*.png.")

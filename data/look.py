@@ -38,8 +38,8 @@ def shares(model, z, config):
 
 
 def watch_episode(path, model, header, environment, seed, decisions, every):
-    """Frames of a model's episode: picture, shares (N,) and return so far of each; and its name
-    with the median milliseconds of a decision."""
+    """Frames of a model's episode: picture, shares (N,) and return so far of each; its name, the
+    median milliseconds of a decision, and the return in the end."""
     config = fac.PlannerConfig(**fac.made_for(header, path))
     frames, total, seconds = [], 0.0, []
     with fac.Planner(model, config) as planner, fac.progress(f"playing {path}", decisions,
@@ -57,7 +57,7 @@ def watch_episode(path, model, header, environment, seed, decisions, every):
             total += reward
             bar.update()
     name = f"{header['kind']}, N = {model.config.num_agents}"
-    return frames, name, 1e3 * float(np.median(seconds))
+    return frames, name, 1e3 * float(np.median(seconds)), total
 
 
 def draw_frames(episodes):
@@ -70,7 +70,7 @@ def draw_frames(episodes):
         image = Image.new("RGB", (width * len(episodes), PIXELS + TEXT), "white")
         draw = ImageDraw.Draw(image)
         for k, (picture, share, total) in enumerate(columns):
-            left, (_, name, ms) = k * width, episodes[k]
+            left, (_, name, ms, _) = k * width, episodes[k]
             image.paste(Image.fromarray(picture), (left, 0))
             height, middle = PIXELS / len(share), left + PIXELS + BARS / 2
             for i, value in enumerate(share / largest[k] * (BARS / 2 - 4)):
@@ -87,6 +87,8 @@ def draw_frames(episodes):
 def command_watch(args):
     """watch: an episode as a moving picture."""
     kind = Path(args.out).suffix
+    fac.need(args.decisions <= fac.EPISODE_STEPS, f"--decisions: an episode has "
+             f"{fac.EPISODE_STEPS}, not {args.decisions}")
     fac.need(kind in (".gif", ".mp4"), f"{args.out}: expected a name that ends in .gif or .mp4")
     fac.pyplot()  # brings Pillow
     if kind == ".mp4":
@@ -116,7 +118,7 @@ def command_watch(args):
             images[0].save(file, format="gif", save_all=True, append_images=images[1:], loop=0,
                            duration=int(1e3 * seconds))
     result = {"out": args.out, "frames": len(images), "bytes": Path(args.out).stat().st_size,
-              "ms": [ms for *_, ms in episodes], "returns": [f[-1][2] for f, *_ in episodes]}
+              "ms": [ms for _, _, ms, _ in episodes], "returns": [total for *_, total in episodes]}
     print(f"{args.out}: {result['frames']} frames, {result['bytes'] / 1e6:.1f} MB")
     return result
 
@@ -252,10 +254,12 @@ def command_agreement(args):
     """agreement: which joint's share ranks its actions as the expert's Q does, and when."""
     student, header, task = open_model(args)
     expert, _ = fac.load_model(args.expert or fac.data_file(task, "expert.npz"))
+    fac.check_task(expert.config, task)
     replay, plt = fac.Replay(args.replay or fac.data_file(task, "replay.npz")), fac.pyplot()
     rng, config = np.random.default_rng(args.seed), fac.PlannerConfig(
         **fac.made_for(header, args.model))
-    _, held_out = replay.starts(1, fac.DistillConfig.held_out)
+    _, held_out = replay.starts(1, header.get("distill", {}).get("held_out",
+                                                                 fac.DistillConfig.held_out))
     obs, actions = replay.sequences(rng.choice(held_out, args.states), 1)
     known = agreement(student, expert, obs, actions[0], rng)
     played, done, rewards, _ = fac.play(student, task, config,

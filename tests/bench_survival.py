@@ -37,26 +37,25 @@ def start(folder, out, steps):
                             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
-def killed_distillation(kills, steps):
+def killed_distillation(folder, kills, steps):
     """Kills at random moments; how often there was progress between two; whether weights agree."""
-    rng, folder = np.random.default_rng(0), Path(tempfile.mkdtemp())
+    rng, stages = np.random.default_rng(0), [0]
     write_expert(folder / "expert.npz")
     write_replay(folder / "replay.npz")
     assert start(folder, "whole", steps).wait() == 0
-    stages, done = [], 0
-    while done < kills:
+    for _ in range(kills):
         process = start(folder, "parts", steps)
         time.sleep(rng.uniform(0, 4))
         if process.poll() is not None:
             break
         process.kill()
         process.wait()
-        done += 1
         checkpoint = folder / "parts" / "checkpoint.npz"
         stages.append(int(np.load(checkpoint)["step"]) if checkpoint.exists() else 0)
     assert start(folder, "parts", steps).wait() == 0
     same = [fac.load_model(folder / out / "student.npz")[0].params for out in ("whole", "parts")]
-    return {"kills": done, "stages": len(set(stages)), "last_stage": stages[-1], "steps": steps,
+    return {"kills": len(stages) - 1, "stages": len(set(stages)), "last_stage": stages[-1],
+            "steps": steps,
             "same_bytes": all(v.tobytes() == same[1][k].tobytes() for k, v in same[0].items()),
             "left": sorted(p.name for p in (folder / "parts").iterdir())}
 
@@ -100,14 +99,14 @@ def memory():
 
 
 def many_plans(plans):
-    """Memory after the first thousand plans and after all."""
+    """Memory after the first hundredth of the plans and after all."""
     model = random_model(latent=2, hidden=4)
     config = fac.PlannerConfig(samples=4, iterations=1, horizon=1)
     with fac.one_thread(), fac.Planner(model, config) as planner, \
             fac.progress("plans", plans, "plan") as bar:
         for i in range(plans):
             planner.act(np.zeros(8, np.float32))
-            if i == 1000:
+            if i == plans // 100:
                 before = memory()
             if i % 1000 == 0:
                 bar.update(1000)
@@ -121,8 +120,9 @@ def main():
     parser.add_argument("--plans", type=int, default=1_000_000, help="[1000000]")
     parser.add_argument("--json", action="store_true", help="print one JSON object as last line")
     args = parser.parse_args()
-    result = {"distill": killed_distillation(args.kills, args.steps),
-              "worker": killed_worker(args.kills), "memory": many_plans(args.plans)}
+    with tempfile.TemporaryDirectory() as folder:
+        result = {"distill": killed_distillation(Path(folder), args.kills, args.steps)}
+    result.update(worker=killed_worker(args.kills), memory=many_plans(args.plans))
     for name, found in result.items():
         print(name, found)
     if args.json:
