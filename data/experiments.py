@@ -538,7 +538,7 @@ def draw_lines(path, panels, xlabel, **axes):
     labels = list(dict.fromkeys(label for lines, _ in panels.values() for label in lines))
     cycle, columns = list(plt.rcParams["axes.prop_cycle"]), min(4, len(panels))
     figure, grid = plt.subplots(-(-len(panels) // columns), columns, squeeze=False,
-                                figsize=(3.6 * columns, 3.2 * -(-len(panels) // columns)),
+                                figsize=(3.6 * columns, 3.8 * -(-len(panels) // columns)),
                                 layout="constrained")
     for ax, (title, (lines, level)) in itertools.zip_longest(grid.flat, panels.items(),
                                                              fillvalue=(None, (None, None))):
@@ -554,7 +554,7 @@ def draw_lines(path, panels, xlabel, **axes):
         if level is not None:
             ax.axhline(level, color="black", linewidth=0.8, linestyle=(0, (1, 3)), label="expert")
         ax.set(title=title, xlabel=xlabel, ylabel="episode return", ylim=(0, None), **axes)
-        ax.legend()
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, fontsize=8)
     fac.save_figure(path, figure)
 
 
@@ -573,11 +573,12 @@ def markdown(heads, rows):
 
 
 def cell(found):
-    """mean ± deviation (seeds), rank correlation of G."""
+    """mean ± deviation over seeds, if there are several (their number), rank correlation of G."""
     if not found:
         return "-"
     rank = f", {found['rank_return']:.2f}" if "rank_return" in found else ""
-    return f"{found['mean']:.0f} ± {found['std']:.0f} ({found['seeds']}){rank}"
+    spread = f" ± {found['std']:.0f} ({found['seeds']})" if found["seeds"] > 1 else ""
+    return f"{found['mean']:.0f}{spread}{rank}"
 
 
 def report_curves(name, path, figures):
@@ -680,7 +681,7 @@ def report_figure8(_, path, figures):
             float(next(row["return_mean"] for row in reversed(own) if row["return_mean"])))
     plt, kinds = fac.pyplot(), ("noise", "0.5", "1.5")
     figure, grid = plt.subplots(len(cells), 3, squeeze=False, layout="constrained",
-                                figsize=(11, 2.6 * len(cells)), sharey="row")
+                                figsize=(11, 2.8 * len(cells)), sharey="row")
     result, table = {}, []
     for row, (task, cases) in zip(grid, cells.items()):
         for ax, kind in zip(row, kinds):
@@ -693,7 +694,6 @@ def report_figure8(_, path, figures):
                     ax.axhline(np.mean(values["none", 0]), color=f"C{i}", linestyle=("-", "--")[i])
             what = "one action is noise" if kind == "noise" else f"one motor x {kind}"
             ax.set(title=f"{task}: {what}", xlabel="action dimension", ylabel="episode return")
-        row[0].legend()
         both = set.intersection(*(set(values) for values in cases.values()))  # measured for all
         result[task] = {case: {kind: float(np.mean([np.mean(values[k, j]) for k, j in both
                                                     if k == kind]))
@@ -702,6 +702,7 @@ def report_figure8(_, path, figures):
         table += [(task, case, *(f"{found[kind]:.0f}" if kind in found else "-"
                                  for kind in ("none", *kinds)))
                   for case, found in sorted(result[task].items())]
+    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     fac.save_figure(figures / "figure8.png", figure)
     return result, markdown(("", "", "undisturbed", *kinds), table)
 
@@ -709,8 +710,8 @@ def report_figure8(_, path, figures):
 REPORT_HEAD = """# The paper's figures, here
 
 Written by `python data/experiments.py report` from the CSVs beside it; README.md says what they
-show. Returns: mean ± deviation over seeds (their number), then the rank correlation of G; every
-run's settings are in its CSV. '10% TD-MPC' has hidden layers of 66 (B.2), which with Table 2's
+show. Returns: mean ± deviation over seeds (their number; one without), then the rank correlation of
+G; every run's settings are in its CSV. '10% TD-MPC' has hidden layers of 66 (B.2), which with Table 2's
 latents of 50 is 3% of the weights; six factored agents have 26%.
 
 """
