@@ -711,8 +711,8 @@ REPORT_HEAD = """# The paper's figures, here
 
 Written by `python data/experiments.py report` from the CSVs beside it; README.md says what they
 show. Returns: mean ± deviation over seeds (their number; one without), then the rank correlation of
-G; every run's settings are in its CSV. '10% TD-MPC' has hidden layers of 66 (B.2), which with Table 2's
-latents of 50 is 3% of the weights; six factored agents have 26%.
+G; every run's settings are in its CSV. '10% TD-MPC' has hidden layers of 66 (B.2), which with
+Table 2's latents of 50 is 3% of the weights; six factored agents have 26%.
 
 """
 REPORTS = {"figure4": report_curves, "figure5": report_curves, "figure7": report_figure7,

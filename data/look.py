@@ -202,19 +202,19 @@ def command_figure9(args):
         for i in range(len(z)):
             ax.scatter(*points[joints == i].T, s=7, marker="os^Dv<>p"[i % 8], label=f"joint {i}")
         ax.set(title=f"latents, {name}", xticks=[], yticks=[])
-    grid[0, 1].legend()
     grid[0, 2].axis("off")
-    if apart is not None:
-        grid[0, 2].text(0, 0.5, f"silhouette by joint {apart:.2f}\njoints shuffled {shuffled:.2f}")
+    grid[0, 2].legend(*grid[0, 1].get_legend_handles_labels(), loc="upper left", title=(
+        "black: the sum" if apart is None else f"black: the sum\nsilhouette by joint {apart:.2f}\n"
+        f"joints shuffled {shuffled:.2f}"))
     moments = {}
     for row, name, episode in zip(grid[1:], ("best", "worst"),
                                   (int(returns.argmax()), int(returns.argmin()))):
         shares = credit(model, obs[episode], actions[episode], config)
         moments[name] = turning_points(shares.sum(0))
         pictures = frames_at(task, seeds[episode], actions[episode], moments[name])
-        for i, share in enumerate(shares):
-            row[0].plot(share - share.mean(), linewidth=1, label=f"joint {i}")
-        row[0].plot(shares.sum(0) - shares.sum(0).mean(), "k-", label="sum")
+        for share in shares:
+            row[0].plot(share - share.mean(), linewidth=1)
+        row[0].plot(shares.sum(0) - shares.sum(0).mean(), "k-")
         row[0].set(title=f"{name} episode: {returns[episode]:.0f}", xlabel="decision",
                    ylabel=f"{config.horizon}-step return less its mean")
         for ax, t in zip(row[1:], moments[name]):
@@ -223,7 +223,6 @@ def command_figure9(args):
             if t in pictures:
                 ax.imshow(pictures[t])
                 ax.set_title(f"decision {t}")
-    grid[1, 0].legend()
     fac.save_figure(args.out, figure)
     result = {"out": args.out, "task": task, "episodes": args.episodes, "silhouette": apart,
               "silhouette_shuffled": shuffled, "return_best": float(returns.max()),
