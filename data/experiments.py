@@ -554,6 +554,9 @@ def draw_lines(path, panels, xlabel, **axes):
         if level is not None:
             ax.axhline(level, color="black", linewidth=0.8, linestyle=(0, (1, 3)), label="expert")
         ax.set(title=title, xlabel=xlabel, ylabel="episode return", ylim=(0, None), **axes)
+        if axes:  # logarithmic: a tick for each point
+            ax.set_xticks(x, [f"{v:.0f}" for v in x])
+            ax.minorticks_off()
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, fontsize=8)
     fac.save_figure(path, figure)
 
