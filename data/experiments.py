@@ -787,8 +787,9 @@ def make_parser():
 
     walkers, steps = ["walker-walk", "walker-run"], fac.DistillConfig.steps
     shipped = sorted(path.parent.name for path in fac.DATA.glob("*/expert.npz"))
-    add_runs("figure4", command_figure4, "Section 5.2: Fac-TDMPC, 100% and 10% TD-MPC and TAP, "
-             "by Algorithm 1; return against steps.", shipped, steps=steps, evaluations=4)
+    add_runs("figure4", command_figure4, "Section 5.2: Fac-TDMPC, TD-MPC as large as the "
+             "expert and a tenth of it, and TAP, by Algorithm 1; return against steps.", shipped,
+             steps=steps, evaluations=4)
     add_runs("figure5", command_figure5, "Section 5.3: KL against MSE, the perturbations' "
              "deviation, the student's temperature, a consistency loss.", walkers, steps=steps,
              evaluations=4)

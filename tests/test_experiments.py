@@ -102,6 +102,21 @@ def test_multiply_adds_count_the_weights_of_equation_2():
         3 * (sizes["_dynamics"] + sizes["_reward"]) + sizes["_Q"])
 
 
+def test_help_teaches():
+    """Of the program and of each command, which names every default."""
+    parser = experiments.make_parser()
+    (commands,) = (a.choices for a in parser._actions if isinstance(a.choices, dict))
+    assert set(commands) == {"table3", "figure4", "figure5", "figure7", "figure8", "figure9",
+                             "figure12", "figure13", "departures", "sweep", "agreement", "watch",
+                             "report"}
+    assert all(name in parser.format_help() for name in commands)
+    for name, command in commands.items():
+        assert f"experiments.py {name}" in command.format_help()
+        without = {action.dest for action in command._actions
+                   if not (action.required or action.nargs == 0 or "[" in action.help)}
+        assert without <= {"beside", "figure", "workers", "scheduler"}
+
+
 # runs ---------------------------------------------------------------------------------
 
 SMALL = ["--tasks", "cheetah-run", "--seeds", "0", "--steps", "4", "--episodes", "1", "--samples",
