@@ -150,6 +150,12 @@ def connect(args):
     return {"backend": backend}
 
 
+def planning_for(header, about):
+    """A model's own planning but for what a run's settings say of it."""
+    own = {k: about[k] for k in ("samples", "iterations", "horizon") if k in about}
+    return fac.PlannerConfig(**{**fac.made_for(header, "model"), **own})
+
+
 def episodes(model, task, planning, seeds, environment=None):
     """Observations (E, T, O) and returns (E,) of a model's episodes, in this process."""
     obs, _, rewards, _ = zip(*fac.decisions(model, task, planning, seeds, environment))
@@ -244,13 +250,12 @@ def distil(task, seed, case, settings):
     settings.pop("data", None)
     own = {k: settings.pop(k, v) for k, v in (("num_agents", None), ("evaluations", 1),
                                               ("episodes", 10))}
-    budget = {k: settings.pop(k) for k in ("samples", "iterations") if k in settings}
+    about = {k: settings.pop(k) for k in ("samples", "iterations") if k in settings}
     config = fac.from_dict(fac.DistillConfig, settings, f"{task}, {case}")
     expert, header = fac.load_model(fac.data_file(task, "expert.npz"))
     distiller = distiller_of(case)(expert, fac.Replay(fac.data_file(task, "replay.npz")), config,
                                    own["num_agents"], seed)
-    planning = fac.PlannerConfig(**{**fac.made_for(header, task), "horizon": config.horizon,
-                                    **budget})
+    planning = planning_for(header, {**about, "horizon": config.horizon})
     playing = dataclasses.replace(planning, samples=64, iterations=3)
     student, tap = distiller.student, case == "TAP"
     environment = None
@@ -372,17 +377,14 @@ def load(task, seed, case, students):
 
 def planning_runs(args, variants):
     """A run for each variant (a dict) of planning with each model of each task."""
-    models = [("expert", 0), *(("student", seed) for seed in args.seeds)]
-    return [make_run(task, seed, case, episodes=args.episodes,
-                     weights=fac.checksum(load(task, seed, case, args.students)[0].params.values()),
-                     **variant)
-            for task in args.tasks for case, seed in models for variant in variants(task)]
-
-
-def planning_for(header, about):
-    """A model's own planning but for `samples` and `iterations`."""
-    budget = {k: about[k] for k in ("samples", "iterations") if k in about}
-    return fac.PlannerConfig(**fac.made_for(header, "model"), **budget)
+    runs = []
+    for task, (case, seed) in itertools.product(
+            args.tasks, [("expert", 0), *(("student", seed) for seed in args.seeds)]):
+        model, _ = load(task, seed, case, args.students)
+        weights = fac.checksum(model.params.values())
+        runs += [make_run(task, seed, case, episodes=args.episodes, weights=weights, **variant)
+                 for variant in variants(task)]
+    return runs
 
 
 def plan_with(task, seed, case, settings, students):
@@ -420,12 +422,13 @@ def command_figure7(args):
     runs = planning_runs(args, lambda task: [{"samples": s, "iterations": i} for s, i in BUDGETS])
     result = run_all(args, functools.partial(plan_with, students=args.students), runs)
     timed = {tuple(row[k] for k in KEY) for row in read_rows(result["out"]) if row["ms"]}
-    for task, (samples, iterations) in itertools.product(args.tasks, BUDGETS):
-        todo = [run for run in runs if run["task"] == task and tuple(run.values()) not in timed
-                and planning_for({}, json.loads(run["settings"])).samples == samples
-                and planning_for({}, json.loads(run["settings"])).iterations == iterations]
-        if todo:
-            append_rows(Path(result["out"]), time_runs(todo, args.students, args.rounds))
+    groups = {}
+    for run in runs:
+        if tuple(run.values()) not in timed:
+            about = json.loads(run["settings"])
+            groups.setdefault((run["task"], about["samples"], about["iterations"]), []).append(run)
+    for todo in groups.values():
+        append_rows(Path(result["out"]), time_runs(todo, args.students, args.rounds))
     return result
 
 
@@ -494,8 +497,6 @@ AUTHORS = {
     "quadruped-run": (916, 825, 863, 857), "humanoid-stand": (453, 468, 823, 735),
     "humanoid-walk": (458, 227, 724, 789)}
 METHODS = ("10% TD-MPC", "TAP", "100% TD-MPC", "Fac-TDMPC")
-
-
 CASES = [*METHODS, *(case for panel in FIGURE5.values() for case in panel)]
 
 
