@@ -63,18 +63,22 @@ def append_rows(path, rows):
     """Add a run's rows to a CSV in one write."""
     text = io.StringIO()
     writer = csv.DictWriter(text, ROW)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "a+b") as file:
-        file.seek(0)
-        before = file.read()
-        if b"\n" not in before:
-            file.truncate(0)
-            writer.writeheader()
-        elif not before.endswith(b"\n"):
-            text.write("\n")  # ends a line that was cut off
-        writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()}
-                         for row in rows)
-        file.write(text.getvalue().encode())
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(path, "a+b") as file:
+            file.seek(0)
+            before = file.read()
+            if b"\n" not in before:
+                file.truncate(0)
+                writer.writeheader()
+            elif not before.endswith(b"\n"):
+                text.write("\n")  # ends a line that was cut off
+            writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v
+                              for k, v in row.items()} for row in rows)
+            file.write(text.getvalue().encode())
+    except OSError as error:
+        raise fac.UserError(f"{path}: can't be written: {error.strerror}; the same command makes "
+                            "what is missing") from None
 
 
 def finished(rows):

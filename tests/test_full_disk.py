@@ -1,0 +1,74 @@
+"""Long commands whose disk is full: one line that names the file, nothing half written is left,
+and the same command goes on when there is room. A limit on the size of files stands for the disk."""
+import os
+import sys
+
+import pytest
+
+import experiments
+import test_cli
+import test_train
+from test_cli import ONE_THREAD, ROOT, distill_arguments, files, launch, student_of, succeeded
+from test_experiments import SET, SMALL
+from test_import_expert import weights, write_state
+
+__all__ = ["files"]  # a fixture
+
+LIMITED = """
+import os, resource, runpy, sys
+size = int(sys.argv[1])
+resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+sys.argv = sys.argv[2:]
+sys.path.insert(0, os.path.dirname(sys.argv[0]))
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no limits there")
+
+
+def full_disk(name, size, script, *arguments, cwd):
+    """Run a command whose files may have `size` bytes; check what it says of the file `name`."""
+    done = launch(["-c", LIMITED, size, ROOT / script, *arguments], cwd, ONE_THREAD)
+    assert done.returncode == 2 and "Traceback" not in done.stderr, done.stderr
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith(f"{os.path.basename(script)}") and ": error: " in last, last
+    assert f"{name}: can't be written: File too large" in last
+    left = [f for _, _, found in os.walk(cwd) for f in found]
+    assert not any(f.startswith(".") or f.endswith(".tmp") for f in left), left
+
+
+@pytest.mark.parametrize("size, name", [(50, "curve.csv"), (1000, "checkpoint.npz")])
+def test_distill(tmp_path, files, size, name):
+    command = distill_arguments(files)
+    full_disk(name, size, "fac_tdmpc_ref.py", *command, "--out", "a", cwd=tmp_path)
+    for out in ("a", "b"):
+        succeeded(test_cli.run(*command, "--out", out, cwd=tmp_path))
+    assert student_of(tmp_path / "a") == student_of(tmp_path / "b")
+
+
+def test_train_expert(tmp_path):
+    full_disk("checkpoint.npz", 1000, "data/train_expert.py", *test_train.TINY, "--out", "a",
+              cwd=tmp_path)
+
+
+def test_experiments(tmp_path):
+    pytest.importorskip("joblib")
+    command = ["sweep", *SMALL, "--set", *SET]
+    full_disk("sweep.csv", 20, "data/experiments.py", *command, cwd=tmp_path)
+    assert experiments.read_rows(tmp_path / "sweep.csv") == []
+    succeeded(launch([ROOT / "data" / "experiments.py", *command], tmp_path))
+    assert len(experiments.finished(experiments.read_rows(tmp_path / "sweep.csv"))) == 1
+
+
+def test_import_expert(tmp_path):
+    model = write_state(tmp_path / "model.pt", weights())
+    full_disk("expert.npz", 1000, "data/import_expert.py", model, "--task", "reacher-hard",
+              "--out", "mine", cwd=tmp_path)
+    assert not (tmp_path / "mine" / "expert.npz").exists()
+
+
+def test_manipulator_demo(tmp_path):
+    pytest.importorskip("matplotlib")
+    (tmp_path / "m.png").write_bytes(b"old")
+    full_disk("m.png", 1000, "manipulator_demo.py", "--figure", "m.png", cwd=tmp_path)
+    assert (tmp_path / "m.png").read_bytes() == b"old"
