@@ -271,7 +271,8 @@ def linear_backward(dy, x, W):
 def elu(x):
     """y = x where x > 0, else exp(x) - 1: the larger of x and exp(min(x, 0)) - 1."""
     y = np.clip(x, -np.inf, 0)  # 3 times as fast as minimum
-    np.expm1(y, out=y)
+    np.exp(y, out=y)  # expm1 takes 4 times as long where there is no AVX-512
+    y -= 1
     return np.maximum(x, y, out=y)
 
 
