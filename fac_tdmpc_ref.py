@@ -1369,7 +1369,7 @@ def read_npz(path, kind):
         raise UserError(f"{path}: header: expected a JSON entry of this name, found none; files "
                         f"are made by data/train_expert.py and distill") from None
     need(header.get("format") == FORMAT, f"{path}: header: format: expected {FORMAT!r}, found "
-         f"{header.get('format')!r}; make the file anew with this version")
+         f"{header.get('format')!r}; a newer version's file needs that version of this project")
     need(header.get("kind") in kind, f"{path}: header: kind: expected {' or '.join(kind)}, found "
          f"{header.get('kind')!r}")
     return header, arrays

@@ -192,7 +192,7 @@ def command_table3(args):
         if robot not in ROBOTS:
             raise fac.UserError(f"unknown robot {robot!r}; known: {', '.join(ROBOTS)}")
     if args.runs < 10:
-        raise fac.UserError(f"runs must be at least 10, not {args.runs}")
+        raise fac.UserError(f"--runs must be at least 10, not {args.runs}")
     if args.figure:
         fac.pyplot()  # before the work, not after it
     prediction, decision, hand_overs = [], [], []

@@ -451,14 +451,15 @@ def read_settings(args):
     distilling = fac.from_args(fac.DistillConfig, args, **FOLLOWING_DEFAULTS)
     for name in ("envs", "refresh", "workers", "threads", "evaluate_every", "evaluate_episodes"):
         if getattr(args, name) < 1:
-            raise fac.UserError(f"{name} must be at least 1, not {getattr(args, name)}")
+            raise fac.UserError(f"--{name.replace('_', '-')} must be at least 1, not "
+                                f"{getattr(args, name)}")
     if not planning.min_std <= config.std_start <= planning.max_std:
         raise fac.UserError(f"training: std_start must lie between the planner's min_std and "
                             f"max_std ({planning.min_std}, {planning.max_std}), not "
                             f"{config.std_start}")
     quota = args.envs * fac.EPISODE_STEPS
     if args.steps < quota:
-        raise fac.UserError(f"{args.envs} environments need at least {quota} steps, not "
+        raise fac.UserError(f"--envs {args.envs} needs at least --steps {quota}, not "
                             f"{args.steps}")
     args.steps -= args.steps % quota  # whole rounds
     _, _, _, dim_action = fac.lookup_task(args.task)

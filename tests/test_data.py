@@ -217,6 +217,7 @@ def test_header_missing_or_no_json_object(tmp_path, expert_file, header):
 
 @pytest.mark.parametrize("changes, parts", [
     ({"format": "fac-tdmpc-ref 0"}, ("header: format", repr(fac.FORMAT), "'fac-tdmpc-ref 0'")),
+    ({"format": "fac-tdmpc-ref 2"}, ("'fac-tdmpc-ref 2'", "newer version")),
     ({"format": None}, ("header: format", repr(fac.FORMAT), "None")),
     ({"kind": "replay"}, ("header: kind", "expert or student", "'replay'")),
     ({"kind": None}, ("header: kind", "expert or student", "None")),
