@@ -16,7 +16,6 @@ numbers as in the paper. One step is 0.1 s (Table 1: freq 10).
 
 import argparse
 import dataclasses
-import json
 import sys
 import time
 
@@ -367,11 +366,11 @@ def draw_figure(path, runs, share):
     fac.save_figure(path, figure)
 
 
-def read_options(argv):
-    """The command line, checked: (args, the planner's settings)."""
-    parser = argparse.ArgumentParser(prog="manipulator_demo.py", description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.error = lambda text: parser.exit(2, f"manipulator_demo.py: error: {text}\n")
+def make_parser():
+    """The command line."""
+    parser = fac.Parser(prog="manipulator_demo.py", description=__doc__,
+                        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.set_defaults(run=command_demo)
     add = parser.add_argument
     add("--seed", type=int, default=1, help="of all random numbers (default 1)")
     add("--steps", type=int, default=100, help="decisions of 0.1 s (default 100)")
@@ -385,16 +384,19 @@ def read_options(argv):
         "most (default), or an exact form; both may be wrong about the joints, as the report says")
     add("--figure", metavar="PATH.png", help="draw Figure 11 (needs matplotlib)")
     add("--json", action="store_true", help="print the numbers as the last line, in JSON")
-    args = parser.parse_args(argv)
+    return parser
+
+
+def planner_config(args):
+    """The planner's settings of a command line, which is checked."""
     for name, least in (("seed", 0), ("steps", 1), ("samples", 1), ("horizon", 1)):
-        if not least <= getattr(args, name) <= 10**8:
-            parser.error(f"--{name} must be in {least} to 10**8, not {getattr(args, name)}")
+        fac.need(least <= getattr(args, name) <= 10**8,
+                 f"--{name} must be in {least} to 10**8, not {getattr(args, name)}")
     if args.figure:
-        if not args.figure.endswith(".png"):
-            parser.error(f"--figure {args.figure} should end in .png")
+        fac.need(args.figure.endswith(".png"), f"--figure {args.figure} should end in .png")
         fac.pyplot()  # UserError now rather than after the run, where matplotlib is missing
-    return args, dataclasses.replace(TABLE_1, samples=args.samples, elites=min(5, args.samples),
-                                     horizon=args.horizon, discount=args.discount)
+    return dataclasses.replace(TABLE_1, samples=args.samples, elites=min(5, args.samples),
+                               horizon=args.horizon, discount=args.discount)
 
 
 def run_demo(args, config):
@@ -472,23 +474,22 @@ the tip rests, and cross
   terms by which one joint undoes another's error""")
 
 
+def command_demo(args):
+    """Everything: measure, print, draw."""
+    begin, config = time.perf_counter(), planner_config(args)
+    runs, result = run_demo(args, config)
+    result["seconds_total"] = time.perf_counter() - begin
+    print_comparison(args, runs, result)
+    print_appendix(result)
+    if args.figure:
+        draw_figure(args.figure, runs, goal_map(np.random.default_rng([args.seed, 2])))
+    settings = {k: v for k, v in vars(args).items() if k != "run"}
+    return {**result, "settings": settings, "cores": fac.cores()}
+
+
 def main(argv=None):
     """Run the command line; returns the exit status."""
-    begin = time.perf_counter()
-    try:
-        args, config = read_options(argv)
-        runs, result = run_demo(args, config)
-        result["seconds_total"] = time.perf_counter() - begin
-        print_comparison(args, runs, result)
-        print_appendix(result)
-        if args.figure:
-            draw_figure(args.figure, runs, goal_map(np.random.default_rng([args.seed, 2])))
-    except (fac.UserError, MemoryError) as error:
-        print(f"manipulator_demo.py: error: {error}", file=sys.stderr)
-        return 2
-    if args.json:
-        print(json.dumps({**result, "settings": vars(args), "cores": fac.cores()}))
-    return 0
+    return fac.run_command(make_parser(), argv)
 
 
 if __name__ == "__main__":

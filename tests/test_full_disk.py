@@ -1,5 +1,5 @@
 """Long commands whose disk is full: one line that names the file, nothing half written is left,
-and the same command goes on when there is room. A limit on the size of files stands for the disk."""
+and the same command goes on when there is room. A limit on the size of files is the full disk."""
 import os
 import sys
 

@@ -174,7 +174,8 @@ def test_table_1():
     config = demo.TABLE_1
     assert (config.iterations, config.samples, config.elites, config.horizon) == (6, 50, 5, 4)
     assert (config.min_std, config.max_std, config.inverse_temperature) == (0.05, 2.0, 0.5)
-    assert demo.read_options(["--samples", "3"])[1] == replace(config, samples=3, elites=3)
+    assert demo.planner_config(
+        demo.make_parser().parse_args(["--samples", "3"])) == replace(config, samples=3, elites=3)
 
 
 @pytest.mark.parametrize("discount", [0.0, 0.7, 1.0])
