@@ -296,14 +296,18 @@ FIGURE5 = {  # panel: {case: settings}; every panel holds the default
 
 
 def distil_all(args, cases):
-    """A student for each seed and task, and each (case, settings) of cases(task)."""
+    """A student of each of `distil_runs`."""
+    return run_all(args, distil, distil_runs(args, cases))
+
+
+def distil_runs(args, cases):
+    """A run for each seed and task, and each (case, settings) of cases(task)."""
     budget = {k: getattr(args, k) for k in ("steps", "evaluations", "episodes", "samples",
                                             "iterations")}
     data = {task: data_checksum(task) for task in args.tasks}
-    return run_all(args, distil, [
-        make_run(task, seed, case, data=data[task], **{**budget, **settings})
-        for seed, task in itertools.product(args.seeds, args.tasks)
-        for case, settings in cases(task)])
+    return [make_run(task, seed, case, data=data[task], **{**budget, **settings})
+            for seed, task in itertools.product(args.seeds, args.tasks)
+            for case, settings in cases(task)]
 
 
 def data_checksum(task):
@@ -325,9 +329,18 @@ def command_figure5(args):
 
 
 def command_figure13(args):
-    """figure13: the number of agents."""
-    return distil_all(args, lambda task: [(f"N = {n}", {"num_agents": n})
-                                          for n in fac.divisors(fac.lookup_task(task)[3])])
+    """figure13: the number of agents; returns first, then milliseconds, nothing else running."""
+    runs = distil_runs(args, lambda task: [(f"N = {n}", {"num_agents": n})
+                                           for n in fac.divisors(fac.lookup_task(task)[3])])
+    return time_all(args, run_all(args, distil, runs), runs, fresh_student)
+
+
+def fresh_student(run):
+    """The student of a run before it learned anything, which takes as long to plan with; header."""
+    expert, header = fac.load_model(fac.data_file(run["task"], "expert.npz"))
+    config, agents = fac.DistillConfig(), json.loads(run["settings"])["num_agents"]
+    sizes = fac.student_config(expert.config, agents, config.sizes, config.encoder_input)
+    return fac.new_student(expert, sizes, config, int(run["seed"]))[1], header
 
 
 def command_departures(args):
@@ -425,24 +438,31 @@ def command_figure7(args):
     """figure7: samples and iterations; returns first, then milliseconds, nothing else running."""
     runs = planning_runs(args, lambda task: [{"samples": s, "iterations": i} for s, i in BUDGETS])
     result = run_all(args, functools.partial(plan_with, students=args.students), runs)
+    return time_all(args, result, runs, lambda run: load(run["task"], run["seed"], run["case"],
+                                                         args.students))
+
+
+def time_all(args, result, runs, opened):
+    """Add rows with milliseconds of the runs that have none. opened(run): (model, header)."""
     timed = {tuple(row[k] for k in KEY) for row in read_rows(result["out"]) if row["ms"]}
-    groups = {}
+    groups = {}  # of one budget, which take turns
     for run in runs:
         if tuple(run.values()) not in timed:
             about = json.loads(run["settings"])
-            groups.setdefault((run["task"], about["samples"], about["iterations"]), []).append(run)
+            groups.setdefault((run["task"], about.get("samples"), about.get("iterations")),
+                              []).append(run)
     for todo in groups.values():
-        append_rows(Path(result["out"]), time_runs(todo, args.students, args.rounds))
+        append_rows(Path(result["out"]), time_runs(todo, opened, args.rounds))
     return result
 
 
-def time_runs(runs, students, rounds):
-    """Rows with milliseconds of the decisions of runs of one budget, which take turns: in one
-    process, and students' with a process on each core."""
+def time_runs(runs, opened, rounds):
+    """Rows with milliseconds of the decisions of runs, which take turns: in one process, and
+    students' with a process on each core."""
     calls = []
     with contextlib.ExitStack() as stack:
         for run in runs:
-            model, header = load(run["task"], run["seed"], run["case"], students)
+            model, header = opened(run)
             planning = planning_for(header, json.loads(run["settings"]))
             obs = np.random.default_rng(0).standard_normal(model.config.dim_obs, fac.F32)
             for workers in {0, fac.useful_workers(model.config.num_agents)}:
@@ -586,7 +606,8 @@ def cell(found):
         return "-"
     rank = f", {found['rank_return']:.2f}" if "rank_return" in found else ""
     spread = f" ± {found['std']:.0f} ({found['seeds']})" if found["seeds"] > 1 else ""
-    return f"{found['mean']:.0f}{spread}{rank}"
+    ms = f", {found['ms']:.1f} / {found['ms_workers']:.1f} ms" if "ms" in found else ""
+    return f"{found['mean']:.0f}{spread}{rank}{ms}"
 
 
 def report_curves(name, path, figures):
@@ -606,6 +627,10 @@ def report_curves(name, path, figures):
                "decisions" if name == "figure12" else "gradient step")
     result = {task: {case: last(curve, ranks[task].get(case)) for case, curve in cases.items()}
               for task, cases in found.items()}
+    for (task, _, case, _), own in rows.items():
+        for row in own:
+            if row["ms"]:  # Figure 13's; the last seed's will do
+                result[task][case].update({k: float(row[k]) for k in ("ms", "ms_workers")})
     cases = list(dict.fromkeys(case for found in result.values() for case in found))
     heads, table = ["", *cases, "expert"], [
         [task, *(cell(found.get(case)) for case in cases),
@@ -808,13 +833,14 @@ def make_parser():
              "half or one and a half times as strong.")):
         sub = add_runs(name, run, help, walkers)
         sub.add_argument("--students", default="runs", help="where distill left TASK-SEED/ [runs]")
-    commands.choices["figure7"].add_argument("--rounds", type=positive, default=20,
-                                             help="timings of each [20]")
     sub = add_runs("figure12", command_figure12, "Appendix C.1: an expert that learns and a "
                    "student that follows it.", ["reacher-easy", "walker-walk", "cheetah-run"])
     sub.add_argument("--decisions", type=positive, default=30_000, help="of training [30000]")
     add_runs("figure13", command_figure13, "Appendix C.2: the number of agents.", walkers,
              steps=steps, evaluations=4)
+    for name in ("figure7", "figure13"):
+        commands.choices[name].add_argument("--rounds", type=positive, default=20,
+                                            help="timings of each [20]")
     sub = add_runs("sweep", command_sweep, "A grid over any settings of distill.",
                    ["reacher-hard"], steps=steps, evaluations=1)
     sub.add_argument("--set", nargs="+", required=True, metavar="SETTING=VALUE,...",

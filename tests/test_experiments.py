@@ -409,6 +409,18 @@ def test_a_csv_without_a_row_is_begun_anew(tmp_path, left):
     assert len(experiments.read_rows(path)) == 1 and path.read_text().count("task") == 1
 
 
+def test_figure_13_distils_and_times_every_number_of_agents(tmp_path, monkeypatch):
+    pytest.importorskip("joblib")
+    monkeypatch.chdir(tmp_path)
+    flags = ["--tasks", "reacher-easy", "--seeds", "0", "--jobs", "1", "--steps", "1", "--episodes",
+             "1", "--evaluations", "1", "--samples", "4", "--iterations", "1", "--rounds", "2"]
+    for _ in range(2):  # nothing is missing the second time
+        assert experiments.main(["figure13", *flags, "--out", "13.csv"]) == 0
+        rows = experiments.read_rows("13.csv")
+        assert [row["case"] for row in rows] == ["N = 1", "N = 3"] * 2
+        assert [bool(row["ms"]) for row in rows] == [False, False, True, True]
+
+
 def write_rows(path, runs):
     """A CSV of runs: (task, seed, case, settings, [row, ...])."""
     for task, seed, case, settings, rows in runs:
@@ -425,6 +437,8 @@ def test_report_draws_what_the_csvs_hold(tmp_path):
                                             {"step": 10, "return_mean": 10.0 + seed,
                                              "minutes": 1.0}])
             for case in cases for seed in (0, 2)] + [
+            ("walker-run", 2, "N = 1", {}, [{"ms": 8.0, "ms_workers": 5.0}])
+            for _ in range(name == "figure13")] + [
             ("walker-run", 1, "TAP", {}, [{"error": "no"}])])
     write_rows(tmp_path / "figure12.csv", [("walker-walk", 0, "online", {}, [
         {"step": 4, "return_mean": 5.0, "expert_mean": 6.0, "minutes": 1.0}])])
@@ -444,6 +458,7 @@ def test_report_draws_what_the_csvs_hold(tmp_path):
     assert round(level) == 674 and found["figure5"]["walker-run"].pop("expert_recorded") == level
     assert found["figure4"]["walker-run"] == dict.fromkeys(experiments.FIGURE4, last)
     assert found["figure5"]["walker-run"] == {"default": last, "MSE": last}
+    assert found["figure13"]["walker-run"]["N = 1"] == {**last, "ms": 8.0, "ms_workers": 5.0}
     assert found["figure12"]["walker-walk"]["expert"]["mean"] == 6.0
     assert found["figure12"]["walker-walk"]["ratio"] == 5 / 6
     assert found["figure8"]["walker-run"]["student"] == {"none": 9.0, "noise": 5.0, "0.5": 5.0,
