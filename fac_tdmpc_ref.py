@@ -172,9 +172,7 @@ class DistillConfig(Settings):
     steps: int = field(14_000, "gradient steps [D1]", paper=100_000, least=1)
     batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=1)
     noise_samples: int = field(5, "K: perturbations of each action [D1]", paper=10, least=2)
-    noise_std: float = field(2.0, "largest deviation of the perturbations [D8]", paper=0.5, above=0)
-    noise_std_min: float = field(0.2, "smallest; each state has its own between, log-uniform [D8]",
-                                 paper=0.5, above=0)
+    noise_std: float = field(0.5, "deviation of the perturbations (authors' code)", above=0)
     clip_actions: bool = field(True, "clip perturbed actions to [-1, 1] [D8]", paper=False)
     reuse: int = field(4, "steps that learn from a state's perturbations [D1]", paper=1, least=1)
     horizon: int = field(3, "H of loss and planning (Table 2)", least=0, most=EPISODE_STEPS - 1)
@@ -203,11 +201,6 @@ class DistillConfig(Settings):
     own_share: float = field(0.25, "share of states from these [D9]", paper=0.0, least=0, most=1)
     held_out: float = field(0.05, "share of episodes held out, for rank correlations",
                             above=0, most=0.5)
-
-    def __post_init__(self):
-        super().__post_init__()
-        if self.noise_std < self.noise_std_min:
-            self.refuse("noise_std", f"at least noise_std_min ({self.noise_std_min})")
 
 
 def stream(seed, use, index=0):
@@ -643,11 +636,9 @@ def learning_rate(config, t):
 def perturbed_batch(expert, student, obs, actions, config, rng):
     """Features (1, F, B), perturbed actions (L, A, B, K) and the expert's predictions for them.
 
-    obs (O, B) and actions (L, A, B) come from the replay. Each state has a deviation of its own
-    for eps_h, and a_h + eps_h is clipped [D8]."""
+    obs (O, B) and actions (L, A, B) come from the replay; a_h + eps_h is clipped [D8]."""
     noise = rng.standard_normal((*actions.shape, config.noise_samples), F32)
-    span = np.log([config.noise_std_min, config.noise_std])
-    noise *= np.exp(rng.uniform(*span, actions.shape[-1])).astype(F32)[:, None]
+    noise *= F32(config.noise_std)
     perturbed = np.add(noise, actions[..., None], out=noise)
     if config.clip_actions:
         np.clip(perturbed, -1, 1, out=perturbed)

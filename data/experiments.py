@@ -288,8 +288,8 @@ def distil(task, seed, case, settings):
 FIGURE4 = {"Fac-TDMPC": {}, "100% TD-MPC": {"num_agents": 1}, "10% TD-MPC": {}, "TAP": {}}
 FIGURE5 = {  # panel: {case: settings}; every panel holds the default
     "loss": {"default": {}, "MSE": {}},
-    "noise deviation": {"default": {}, **{f"noise {x}": {"noise_std": x, "noise_std_min": x}
-                                          for x in (0.1, 0.5, 2.0)}},
+    "noise deviation": {"default": {}, **{f"noise {x}": {"noise_std": x}
+                                          for x in (0.1, 1.0, 2.0)}},
     "student temperature": {"default": {}, **{f"T_s {x}": {"temperature_student": x}
                                               for x in (0.1, 2.0)}},
     "consistency": {"default": {}, "consistency": {}}}

@@ -236,9 +236,7 @@ class TorchDistiller:
         with torch.no_grad():
             rows = self.starts[torch.randint(len(self.starts), (batch,))]
             actions = self.action[rows + torch.arange(steps)[:, None]].repeat_interleave(noise, 1)
-            span = np.log([config.noise_std_min, config.noise_std])
-            std = torch.empty(batch).uniform_(*span).exp().repeat_interleave(noise)[:, None]
-            actions = (actions + std * torch.randn_like(actions)).clamp(-1, 1)
+            actions = (actions + config.noise_std * torch.randn_like(actions)).clamp(-1, 1)
             latent = run_network(fac.ENCODER, self.expert, "_encoder", self.obs[rows][None])
             targets = self.rollout(self.expert, latent.repeat_interleave(noise, 1),
                                    actions[:, :, None])

@@ -200,7 +200,7 @@ def test_preset_paper_is_the_paper(monkeypatch):
                 "lam": 0.5, "reward_coef": 0.5, "value_coef": 0.1,
                 "kl": "reverse", "encoder_input": "observation", "lr": 1e-4,
                 "lr_schedule": "constant", "warmup": 0, "grad_clip": 10, "sizes": "table2",
-                "noise_std": 0.5, "noise_std_min": 0.5, "clip_actions": False, "new_targets": 0,
+                "noise_std": 0.5, "clip_actions": False, "new_targets": 0,
                 "reuse": 1, "own_episodes": 0, "own_share": 0}
     assert {k: found[k] for k in expected} == expected
     assert (planner.samples, planner.iterations, planner.num_elites, planner.pi_trajs,
@@ -533,7 +533,7 @@ def test_a_killed_run_whose_student_plays_goes_on(tmp_path, files, no_plots):
 @pytest.mark.parametrize("flags, parts", [
     (["--seed", "1"], ["seed: expected 1, found 0"]),
     (["--num-agents", "1"], ["num_agents: expected 1, found 3"]),
-    (["--noise-std", "0.25"], ["noise_std: expected 0.25, found 2.0"]),
+    (["--noise-std", "0.25"], ["noise_std: expected 0.25, found 0.5"]),
     (["--expert", "{files}/other.npz"], ["(data"]),
     (["--replay", "{files}/longer.npz"], ["(data"]),
     (["--replay", "{files}/named.npz"], ["(data"]),

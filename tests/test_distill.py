@@ -110,7 +110,7 @@ def test_a_resumed_run_ends_as_an_uninterrupted_one(replay, monkeypatch, pool, o
 
 def test_a_share_of_the_states_is_the_students_own(replay):
     config = fac.dataclasses.replace(CONFIG, encoder_input="observation", own_share=0.25,
-                                     noise_std=1e-3, noise_std_min=1e-3, batch_size=400)
+                                     noise_std=1e-3, batch_size=400)
     with fresh(replay, config) as distiller:
         distiller.add(own_episodes(7, 8))
         distiller.add(own_episodes(9))
@@ -262,7 +262,7 @@ def test_no_two_uses_of_a_seed_share_numbers():
 @pytest.mark.parametrize("n", [1, 3])
 @pytest.mark.parametrize("odd", [
     {"batch_size": 1}, {"noise_samples": 2}, {"horizon": 0}, {"steps": 1}, {"reuse": 7},
-    {"batch_size": 3, "reuse": 1}, {"warmup": 0}, {"lam": 0.0}, {"noise_std_min": 2.0}])
+    {"batch_size": 3, "reuse": 1}, {"warmup": 0}, {"lam": 0.0}])
 def test_odd_settings_learn_all_the_same(replay, odd, n):
     config = fac.dataclasses.replace(CONFIG, **{"batch_size": 4, "steps": 3, **odd})
     distiller, losses = distilled(replay, config, config.steps, n)

@@ -379,7 +379,7 @@ def test_departures_are_those_that_the_settings_name(monkeypatch):
     assert set(found) == {"default", "D2", "D3", "D5", "D8", "D9"}  # D7: reacher's
     own = set(found["default"])
     assert {k: v for k, v in found["D8"].items() if k not in own} == {
-        "noise_std": 0.5, "noise_std_min": 0.5, "clip_actions": False}
+        "clip_actions": False}
     assert found["D2"]["kl"] == "reverse" and found["D9"]["own_episodes"] == 0
 
 

@@ -253,7 +253,7 @@ def test_adam_and_clipping_against_torch(size, lr, clip, seed):
 
 def test_configs_refuse_nonsense():
     for wrong in ({"kl": "sideways"}, {"steps": 0}, {"noise_samples": 1}, {"lr": 0.0},
-                  {"temperature_expert": -1.0}, {"held_out": 1.0}, {"noise_std": 0.1}):
+                  {"temperature_expert": -1.0}, {"held_out": 1.0}, {"noise_std": 0.0}):
         with pytest.raises(fac.UserError, match=next(iter(wrong))):
             fac.DistillConfig(**wrong)
     for f in dataclasses.fields(fac.DistillConfig):
