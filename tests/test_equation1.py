@@ -147,6 +147,7 @@ def test_half_precision_ends_at_the_last_layer():
     from torch_learner import TorchLearner, heads, torch
     learner = TorchLearner(small_learner(np.random.default_rng(0), np.float32).model, CONFIG,
                            "cpu", "bfloat16")
+    torch.manual_seed(0)
     x = torch.randn(1, 50, CONFIG.latent_dim + 2)
     torch.nn.init.normal_(learner.params["_Q1.5.weight"])
     with torch.no_grad():
