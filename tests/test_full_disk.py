@@ -8,7 +8,7 @@ import pytest
 import experiments
 import test_cli
 import test_train
-from test_cli import ONE_THREAD, ROOT, distill_arguments, files, launch, student_of, succeeded
+from test_cli import ROOT, distill_arguments, files, launch, student_of, succeeded
 from test_experiments import SET, SMALL
 from test_import_expert import weights, write_state
 
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no limits there
 
 def full_disk(name, size, script, *arguments, cwd):
     """Run a command whose files may have `size` bytes; check what it says of the file `name`."""
-    done = launch(["-c", LIMITED, size, ROOT / script, *arguments], cwd, ONE_THREAD)
+    done = launch(["-c", LIMITED, size, ROOT / script, *arguments], cwd)
     assert done.returncode == 2 and "Traceback" not in done.stderr, done.stderr
     last = done.stderr.splitlines()[-1]
     assert last.startswith(f"{os.path.basename(script)}") and ": error: " in last, last
@@ -37,10 +37,10 @@ def full_disk(name, size, script, *arguments, cwd):
     assert not any(f.startswith(".") or f.endswith(".tmp") for f in left), left
 
 
-@pytest.mark.parametrize("size, name", [(50, "curve.csv"), (1000, "checkpoint.npz")])
-def test_distill(tmp_path, files, size, name):
+def test_distill(tmp_path, files):
     command = distill_arguments(files)
-    full_disk(name, size, "fac_tdmpc_ref.py", *command, "--out", "a", cwd=tmp_path)
+    for size, name in ((50, "curve.csv"), (1000, "checkpoint.npz")):
+        full_disk(name, size, "fac_tdmpc_ref.py", *command, "--out", "a", cwd=tmp_path)
     for out in ("a", "b"):
         succeeded(test_cli.run(*command, "--out", out, cwd=tmp_path))
     assert student_of(tmp_path / "a") == student_of(tmp_path / "b")
