@@ -855,7 +855,8 @@ def make_parser():
     sub.add_argument("--figures", default=fac.DATA / "figures", help="[data/figures]")
     sub = fac.add_command(
         commands, "watch", command_watch, "An episode as a moving picture: beside the robot a bar "
-        "for each agent, what its plan is worth above doing nothing; below, a decision's time.")
+        "for each agent, what its plan is worth above doing nothing (scaled for each model); "
+        "below, a decision's time.")
     sub.add_argument("--model", required=True, help="an expert.npz or student.npz")
     sub.add_argument("--beside", help="another one, on the same episode")
     sub.add_argument("--task", help="one of: " + ", ".join(fac.TASKS) + " [the model's own]")

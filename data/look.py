@@ -203,9 +203,10 @@ def command_figure9(args):
             ax.scatter(*points[joints == i].T, s=7, marker="os^Dv<>p"[i % 8], label=f"joint {i}")
         ax.set(title=f"latents, {name}", xticks=[], yticks=[])
     grid[0, 2].axis("off")
-    grid[0, 2].legend(*grid[0, 1].get_legend_handles_labels(), loc="upper left", title=(
-        "black: the sum" if apart is None else f"black: the sum\nsilhouette by joint {apart:.2f}\n"
-        f"joints shuffled {shuffled:.2f}"))
+    title = "black: the sum" if apart is None else (
+        f"black: the sum\nsilhouette by joint {apart:.2f}\njoints shuffled {shuffled:.2f}")
+    grid[0, 2].legend(*grid[0, 1].get_legend_handles_labels(), loc="upper left",
+                      ncols=1 + len(z) // 8, title=title)
     moments = {}
     for row, name, episode in zip(grid[1:], ("best", "worst"),
                                   (int(returns.argmax()), int(returns.argmin()))):
@@ -273,7 +274,7 @@ def command_agreement(args):
         ax.plot(np.arange(len(line)) * width + width / 2, line, label=f"joint {j}")
     ax.set(xlabel="decision", ylabel="rank correlation with the expert's Q", ylim=(None, 1),
            title=f"{task}, the worst of {args.episodes} episodes: {rewards[worst].sum():.0f}")
-    ax.legend()
+    ax.legend(ncols=1 + len(own) // 8)
     fac.save_figure(args.out, figure)
     result = {"out": args.out, "task": task, "held_out": known.mean(1).tolist(),
               "worst_episode": own.mean(1).tolist(), "when": when.tolist(),

@@ -169,9 +169,11 @@ class ReplayBuffer:
         reward = self.reward[episode, rows[:-1]]
         return obs.swapaxes(1, 2), action.swapaxes(1, 2), reward, (episode, start)
 
-    def write(self, path, header):
-        """A file for `Replay`: oldest episode first; an episode's last row has no action."""
-        order = np.arange(self.count - len(self), self.count) % len(self.reward)
+    def write(self, path, header, episodes=None):
+        """A file for `Replay` with the newest `episodes` or all that are held: oldest first; an
+        episode's last row has no action."""
+        episodes = min(len(self), episodes or len(self))
+        order = np.arange(self.count - episodes, self.count) % len(self.reward)
         action = np.zeros((len(order), fac.EPISODE_STEPS + 1, self.action.shape[2]), np.float16)
         action[:, :-1] = self.action[order]
         continues = np.ones(action.shape[:2], bool)
@@ -511,7 +513,8 @@ def export(training, out, result):
              "updates": result["updates"], "minutes": round(training.seconds / 60, 1),
              **training.learner.about, "training": dataclasses.asdict(config),
              "training_planner": dataclasses.asdict(training.planning)}
-    training.buffer.write(out / "replay.npz", about)
+    training.buffer.write(out / "replay.npz", about,
+                          max(1, args.replay // fac.EPISODE_STEPS))
     rows = [("", "return", "ms a decision")]
     for kind, model in training.models.items():
         header, prefix = {"kind": kind, **about}, "" if kind == "expert" else "student_"
@@ -591,6 +594,8 @@ def make_parser():
     add("--out", help="folder for the results [runs/train-TASK-SEED]")
     add("--episodes", type=natural, default=20, help="evaluation episodes at the end, with MPPI's "
         "default budget; 0: none [20]")
+    add("--replay", type=natural, default=100_000, help="transitions in replay.npz, the newest "
+        "[100000]")
     add("--evaluate-every", type=natural, default=4_000, help="decisions between two evaluations "
         "on the way [4000]")
     add("--evaluate-episodes", type=natural, default=10, help="episodes in one [10]")

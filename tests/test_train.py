@@ -51,6 +51,8 @@ def test_the_buffer_drops_the_oldest_and_writes_a_replay(tmp_path, dtype):
     assert replay.transitions == 2 * fac.EPISODE_STEPS
     assert replay.observation[0, 0] == 2 and replay.observation[-1, 0] == 3  # oldest first
     assert np.allclose(replay.action[:500], buffer.action[1], atol=1e-3)
+    buffer.write(tmp_path / "replay.npz", {"task": "reacher-easy"}, episodes=1)
+    assert set(fac.Replay(tmp_path / "replay.npz").observation[:, 0]) == {3}  # the newest
 
 
 def test_segments_are_in_order_and_most_get_other_targets():
