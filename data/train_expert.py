@@ -169,11 +169,11 @@ class ReplayBuffer:
         reward = self.reward[episode, rows[:-1]]
         return obs.swapaxes(1, 2), action.swapaxes(1, 2), reward, (episode, start)
 
-    def write(self, path, header, episodes=None):
-        """A file for `Replay` with the newest `episodes` or all that are held: oldest first; an
+    def write(self, path, header, episodes=0):
+        """A file for `Replay` with the newest `episodes` (0: all that are held), oldest first; an
         episode's last row has no action."""
-        episodes = min(len(self), episodes or len(self))
-        order = np.arange(self.count - episodes, self.count) % len(self.reward)
+        held = np.arange(self.count - len(self), self.count) % len(self.reward)
+        order = held[-episodes:]
         action = np.zeros((len(order), fac.EPISODE_STEPS + 1, self.action.shape[2]), np.float16)
         action[:, :-1] = self.action[order]
         continues = np.ones(action.shape[:2], bool)
