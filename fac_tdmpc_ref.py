@@ -1649,12 +1649,19 @@ def write_json(path, found):
         json.dump(found, file, indent=1)
 
 
+@contextlib.contextmanager
+def optional(library, extra):
+    """Around an import: UserError that names what to install where the library is missing."""
+    try:
+        yield
+    except ImportError:
+        raise UserError(f"this needs {library}: pip install 'fac-tdmpc-ref[{extra}]'") from None
+
+
 def pyplot():
     """matplotlib.pyplot, in this project's style, without a display; UserError if missing."""
-    try:
+    with optional("matplotlib", "plots"):
         import matplotlib
-    except ImportError:
-        raise UserError("pictures need matplotlib: pip install 'fac-tdmpc-ref[plots]'") from None
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
     cycle = matplotlib.cycler(  # told apart in black and white, too

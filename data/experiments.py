@@ -106,11 +106,8 @@ def attempt(function, run, home):
 
 def run_all(args, function, runs):
     """function(task, seed, case, settings), rows, of all runs that the CSV doesn't hold; result."""
-    try:
+    with fac.optional("joblib", "experiments"):
         import joblib
-    except ImportError:
-        raise fac.UserError("experiments need joblib: pip install 'fac-tdmpc-ref[experiments]'"
-                            ) from None
     for task in args.tasks:
         fac.lookup_task(task)
     path = Path(args.out or RESULTS / f"{args.command}.csv")
@@ -141,11 +138,8 @@ def connect(args):
     """joblib's arguments for where runs run: processes here, or a dask cluster."""
     backend, address = getattr(args, "backend", "loky"), getattr(args, "scheduler", None)
     if backend == "dask":
-        try:
+        with fac.optional("dask", "cluster"):
             from dask.distributed import Client
-        except ImportError:
-            raise fac.UserError("--backend dask needs it: pip install 'fac-tdmpc-ref[cluster]'"
-                                ) from None
         fac.need(address, "--backend dask needs --scheduler tcp://HOST:PORT")
         try:
             Client(address, timeout=10)

@@ -263,10 +263,8 @@ FUNCTIONS = {"collections OrderedDict": (dict, 0),  # and how many arguments the
 
 def read_safetensors(path):
     """{name: array} of a .safetensors file, by way of that library."""
-    try:
+    with fac.optional("safetensors", "safetensors"):
         from safetensors import deserialize
-    except ImportError:
-        raise fac.UserError("needs a library: pip install 'fac-tdmpc-ref[safetensors]'") from None
     need(path.stat().st_size <= MAX_BYTES, f"expected at most {MAX_BYTES} bytes")
     data = path.read_bytes()
     need(int.from_bytes(data[:8], "little") <= MAX_HEADER,

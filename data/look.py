@@ -92,11 +92,8 @@ def command_watch(args):
     fac.need(kind in (".gif", ".mp4"), f"{args.out}: expected a name that ends in .gif or .mp4")
     fac.pyplot()  # brings Pillow
     if kind == ".mp4":
-        try:
+        with fac.optional("imageio for .mp4", "experiments"):
             import imageio_ffmpeg  # noqa: F401
-        except ImportError:
-            raise fac.UserError(".mp4 needs imageio: pip install 'fac-tdmpc-ref[experiments]'; or "
-                                "write a .gif") from None
     models = [(path, *fac.load_model(path)) for path in (args.model, args.beside) if path]
     task = args.task or models[0][2].get("task")
     for _, model, _ in models:
@@ -131,13 +128,10 @@ SMOOTH = 10  # decisions over which a change of the return counts
 def clusters(z, rng, points):
     """Latents (N, m, B) of some states as points: t-SNE and PCA, (n, 2) each, their joints (n,),
     and the silhouette by joint and by shuffled joints."""
-    try:
+    with fac.optional("scikit-learn", "experiments"):
         from sklearn.decomposition import PCA
         from sklearn.manifold import TSNE
         from sklearn.metrics import silhouette_score
-    except ImportError:
-        raise fac.UserError("figure9 needs scikit-learn: pip install "
-                            "'fac-tdmpc-ref[experiments]'") from None
     chosen = z[:, :, rng.choice(z.shape[2], min(points, z.shape[2]), replace=False)]
     x = chosen.swapaxes(1, 2).reshape(-1, z.shape[1])
     joints = np.repeat(np.arange(len(z)), chosen.shape[2])

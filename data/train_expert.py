@@ -194,10 +194,8 @@ def make_learner(args, sizes, config):
     rng = fac.stream(args.seed, "expert")
     if args.backend == "numpy":
         return Learner(sizes, config, rng)
-    try:
+    with fac.optional("PyTorch", "torch"):
         import torch
-    except ImportError:
-        raise fac.UserError("--backend torch needs PyTorch: pip install torch") from None
     from torch_learner import TorchLearner
     torch.set_num_threads(args.threads)
     model = fac.WorldModel.create(sizes, rng, policy=True)

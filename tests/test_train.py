@@ -330,8 +330,8 @@ def test_numpy_s_learner_needs_no_pytorch(tmp_path):
     env = {**ONE_THREAD, "PYTHONPATH": os.pathsep.join([str(SCRIPT.parent), str(ROOT)])}
     run = ["-c", code, *SMALL, "--minutes", "1e-9"]
     succeeded(launch(run, tmp_path, env))
-    refused(launch([*run, "--backend", "torch"], tmp_path, env), "pip install torch",
-            program="train_expert.py")
+    refused(launch([*run, "--backend", "torch"], tmp_path, env),
+            "pip install 'fac-tdmpc-ref[torch]'", program="train_expert.py")
 
 
 def test_help_is_quick_and_starts_nothing(tmp_path):
