@@ -140,7 +140,8 @@ class PlannerConfig(Settings):
     iterations: int = field(4, "refinements of the proposal in a decision [D10]", paper=6, least=1)
     elites: int = field(0, "best ones, which refine it; 0: samples / 8 (Table 2: 64)", least=0)
     pi_trajs: int = field(24, "policy proposals, where there is a policy (Table 2)", least=0)
-    horizon: int = field(3, "H of Equation 2 (Table 2)", least=0, most=EPISODE_STEPS - 1)
+    horizon: int = field(3, "H of Equation 2, unless the model's file names its own (Table 2)",
+                         least=0, most=EPISODE_STEPS - 1)
     discount: float = field(0.99, "gamma, unless the model's file names its own (Table 2)",
                             least=0, most=1)
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)", above=0)
@@ -151,7 +152,7 @@ class PlannerConfig(Settings):
     returns: str = field("fast", "Equation 2 as it reads (plain: h_step_return), or the same, fast",
                          choices=("fast", "plain"))
     output: str = field("sampled", "the action: an elite drawn by score (TD-MPC's code) or the "
-                        "proposal's mean (the paper's text)", choices=("sampled", "mean"))
+                        "proposal's mean", paper="mean", choices=("sampled", "mean"))
 
     def __post_init__(self):
         super().__post_init__()
@@ -365,24 +366,24 @@ class Adam:
     """Adam as PyTorch defines it, with clipping, on a dict of arrays: all of them views of one
     vector, so that a step is a few vector calls. Add to `grads`, then `step`."""
 
-    def __init__(self, arrays, betas=(0.9, 0.999), eps=1e-8):
+    def __init__(self, arrays):
         self.vector, self.params = flatten(arrays)
         self.gradient, self.grads = flatten({k: np.zeros_like(v) for k, v in arrays.items()})
         self.m, self.v = np.zeros_like(self.vector), np.zeros_like(self.vector)
-        self.betas, self.eps, self.t = betas, eps, 0
+        self.t = 0
 
     def step(self, lr, clip=np.inf):
         """params -= lr m_hat / (sqrt(v_hat) + eps) of the gradient, clipped to norm `clip`.
 
         Sets the gradient to zero again; returns its norm."""
-        length, (beta1, beta2) = float(np.linalg.norm(self.gradient)), self.betas
+        length, beta1, beta2, eps = float(np.linalg.norm(self.gradient)), 0.9, 0.999, 1e-8
         if length > clip:
             self.gradient *= self.gradient.dtype.type(clip / (length + 1e-6))  # PyTorch's 1e-6
         self.t += 1
         self.m += (1 - beta1) * (self.gradient - self.m)
         self.v += (1 - beta2) * (self.gradient ** 2 - self.v)
         root = np.sqrt(self.v / (1 - beta2 ** self.t))
-        self.vector -= lr / (1 - beta1 ** self.t) * self.m / (root + self.eps)
+        self.vector -= lr / (1 - beta1 ** self.t) * self.m / (root + eps)
         self.gradient[:] = 0
         return length
 
@@ -425,14 +426,10 @@ class WorldModel:
 
     def encode(self, obs):
         """s = f_E(g).  obs (O, B) -> latents (N, m, B)."""
-        return self.encode_features(self.encoder_features(obs))
-
-    def encoder_features(self, obs):
-        """What the trained encoder reads, (1, F, B): the observation or the expert's latent."""
         x = obs[None]
-        if self.config.expert_latent_dim:
+        if self.config.expert_latent_dim:  # a student reads the expert's latent [D3]
             x = forward(ENCODER, self.params, "_expert_encoder", x)
-        return x
+        return self.encode_features(x)
 
     def encode_features(self, x, tape=None):
         """The trained encoder on (1, F, B); its output is cut into the agents' latents."""
@@ -513,17 +510,17 @@ def unroll(model, z, actions, transitions, tapes=None):
     z (N, m, B), actions (L, A, B, K): K perturbed copies of a trajectory. Returns the networks'
     input x (N, m + d, L * B * K), columns in the order (L, B, K), with s_{h+1} = f_T(s_h, a_h),
     and the last latents (N, m, B * K) if there are L transitions (else there are L - 1)."""
-    steps, _, batch, noise = actions.shape
+    L, _, B, K = actions.shape
     n, m, d = model.config.num_agents, model.config.latent_dim, model.config.agent_actions
-    columns = batch * noise
-    x = np.empty((n, m + d, steps * columns), z.dtype)
-    x[:, m:] = actions.reshape(steps, n, d, columns).transpose(1, 2, 0, 3).reshape(n, d, -1)
-    x[:, :m, :columns] = np.repeat(z, noise, axis=2)
+    columns = B * K
+    x = np.empty((n, m + d, L * columns), z.dtype)
+    x[:, m:] = actions.reshape(L, n, d, columns).transpose(1, 2, 0, 3).reshape(n, d, -1)
+    x[:, :m, :columns] = np.repeat(z, K, axis=2)
     end = None
     for h in range(transitions):
         end = forward(MLP, model.params, "_dynamics", x[:, :, h * columns:(h + 1) * columns],
                       None if tapes is None else tapes[f"_dynamics {h}"])
-        if h < steps - 1:
+        if h < L - 1:
             x[:, :m, (h + 1) * columns:(h + 2) * columns] = end
     return x, end
 
@@ -536,9 +533,9 @@ def predict(model, z, actions, tapes=None):
 
 def run_heads(model, x, actions, tapes=None):
     """Global reward and both Q of `unroll`'s x: the sums over agents, three (L, B, K)."""
-    steps, _, batch, noise = actions.shape
+    L, _, B, K = actions.shape
     return [forward(kinds, model.params, name, x, None if tapes is None else tapes[name]).sum(0)
-            .reshape(steps, batch, noise) for name, kinds in HEADS]
+            .reshape(L, B, K) for name, kinds in HEADS]
 
 
 def predict_backward(model, tapes, d_outputs, grads, d_latents=None):
@@ -547,20 +544,20 @@ def predict_backward(model, tapes, d_outputs, grads, d_latents=None):
     d_outputs: gradients of the three outputs; d_latents (L, N, m, B * K): of s_1, ..., s_L, where
     there were L transitions."""
     n, m = model.config.num_agents, model.config.latent_dim
-    (steps, batch, noise), dx = d_outputs[0].shape, 0
-    columns = batch * noise
+    (L, B, K), dx = d_outputs[0].shape, 0
+    columns = B * K
     for (name, kinds), d_out in zip(HEADS, d_outputs):
         # the global output is the sum over agents: each share has the same gradient
         d_share = np.repeat(d_out.reshape(1, 1, -1), n, 0)
         dx = dx + backward(kinds, model.params, name, tapes[name], d_share, grads)
-    for h in reversed(range(steps - (d_latents is None))):
+    for h in reversed(range(L - (d_latents is None))):
         d_next = 0 if d_latents is None else d_latents[h]
-        if h < steps - 1:
+        if h < L - 1:
             d_next = d_next + dx[:, :m, (h + 1) * columns:(h + 2) * columns]
         dx[:, :, h * columns:(h + 1) * columns] += backward(
             MLP, model.params, "_dynamics", tapes[f"_dynamics {h}"],
             np.ascontiguousarray(d_next), grads)
-    return dx[:, :m, :columns].reshape(n, m, batch, noise).sum(3)
+    return dx[:, :m, :columns].reshape(n, m, B, K).sum(3)
 
 
 # ==== 4. Model distillation (section 4.4, Algorithm 1, Equation 4) ====================
@@ -686,12 +683,14 @@ class Distiller:
         rng = stream(self.seed, f"pool {number}", part)
         obs, actions = self.replay.sequences(rng.choice(self.train_starts, size),
                                              self.config.horizon + 1)
+        own = np.zeros(size, bool)
         if len(self.own):  # [D9]
-            chosen = rng.random(size) < self.config.own_share
-            obs[:, chosen] = self.own[rng.integers(len(self.own), size=chosen.sum())].T
-            actions[..., chosen] = policy_rollout(
-                self.expert, self.expert.encode(obs[:, chosen]), [F32(0)] * len(actions))[:, 0]
+            own = rng.random(size) < self.config.own_share
+            obs[:, own] = self.own[rng.integers(len(self.own), size=own.sum())].T
         renew_targets(self.replay.header.get("task"), obs, self.config.new_targets, rng)
+        if own.any():
+            actions[..., own] = policy_rollout(
+                self.expert, self.expert.encode(obs[:, own]), [F32(0)] * len(actions))[:, 0]
         return perturbed_batch(self.expert, self.student, obs, actions, self.config, rng)
 
     def batch(self, t):
@@ -735,6 +734,7 @@ class Distiller:
 
         play(first, count): the states, as `add` takes them, of episodes that the student plays, of
         which it has played `first` before; not needed without own episodes [D9]."""
+        need(play or not self.config.own_episodes, "pass `play`, or configure own_episodes=0")
         while self.t < self.config.steps:
             quarter, played = 4 * self.t // self.config.steps, len(self.own) // EPISODE_STEPS
             if quarter * self.config.own_episodes > played:
@@ -747,7 +747,7 @@ class Distiller:
         return self.optimizer.t
 
     def add(self, observation):
-        """Let the states (E, T, O) of episodes that the student played join the data [D9]."""
+        """Let the states (E, EPISODE_STEPS, O) of the student's episodes join the data [D9]."""
         self.own = np.concatenate([self.own, observation.reshape(-1, self.own.shape[1])
                                    .astype(np.float16)])
         self._number = None  # its pool is drawn again, with them
@@ -934,10 +934,14 @@ class Planner(contextlib.AbstractContextManager):
         need(np.isfinite(obs).all(), "observation: holds values that are not finite")
         with one_thread():
             z = self.model.encode(obs[:, None])
-            for i, part in enumerate(self._parts[1:]):
-                self._workers.send(i, z[part])
-            own = self.own.plan(z[self._parts[0]])
-            return np.concatenate([own, *self._workers.receive_all()]).reshape(-1)
+            try:
+                for i, part in enumerate(self._parts[1:]):
+                    self._workers.send(i, z[part])
+                own = self.own.plan(z[self._parts[0]])
+                return np.concatenate([own, *self._workers.receive_all()]).reshape(-1)
+            except BaseException:  # answers left unread would be the next decision's
+                self.close()
+                raise
 
     def close(self):
         """End the worker processes."""
@@ -1400,7 +1404,7 @@ def load_model(path):
 def made_for(header, where):
     """The discount and the horizon that a model's file was trained, or distilled, for."""
     found = {}
-    for group, name in (("training", "discount"), ("distill", "horizon")):
+    for group, name in (("training", "discount"), ("training", "horizon"), ("distill", "horizon")):
         settings = header.get(group) or {}
         need(isinstance(settings, dict), f"{where}: header: {group}: expected settings, found "
              f"{settings!r}")
@@ -1444,7 +1448,7 @@ class Replay:
             (held if i % every == every - 1 else training).append(np.arange(begin, end - steps + 1))
         need(sum(map(len, training)) and sum(map(len, held)),
              f"{self.path}: {len(self.ends)} episodes are too few to hold out a share of "
-             f"{held_out} and sample {steps} steps; collect more")
+             f"{held_out} and sample {steps} steps; collect more, or hold out a larger share")
         return np.concatenate(training), np.concatenate(held)
 
     def sequences(self, starts, steps):
@@ -1748,23 +1752,22 @@ def command_distill(args):
 def load_data(args):
     """(expert, its header, replay, the expert's path) that distill's arguments name."""
     lookup_task(args.task)
-    if args.expert and os.path.isdir(args.expert):  # as train_expert.py and data/TASK hold them
-        args.replay = args.replay or Path(args.expert) / "replay.npz"
-        args.expert = Path(args.expert) / "expert.npz"
-    path = args.expert or data_file(args.task, "expert.npz")
+    path = Path(args.expert or data_file(args.task, "expert.npz"))
+    if path.is_dir():  # as train_expert.py and data/TASK hold them
+        path /= "expert.npz"
     expert, header = load_model(path)
     for key, expected in (("kind", "expert"), ("task", args.task)):
         need(header.get(key) == expected, f"{path}: header: {key}: expected {expected!r}, found "
              f"{header.get(key)!r}")
     check_task(expert.config, args.task)
     Environment(args.task)  # what is missing is missed now, not after the last step
-    return expert, header, Replay(args.replay or data_file(args.task, "replay.npz")), path
+    return expert, header, Replay(args.replay or path.with_name("replay.npz")), path
 
 
 def distil_and_save(distiller, args, planning, header, out):
     """Algorithm 1 to its end; writes student, curve and configuration. Returns result's part."""
     student, config, replay = distiller.student, distiller.config, distiller.replay
-    playing = dataclasses.replace(planning, samples=64, iterations=3)
+    playing = dataclasses.replace(planning, samples=64, iterations=3, elites=0)
     settings = {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
                 "distill": asdict(config),
                 "own_planner": asdict(playing) if config.own_episodes else None,
@@ -1945,7 +1948,7 @@ def make_parser():
     add("--preset", choices=("default", "paper"), default="default", help="paper: the paper's "
         "value of every setting that names one below (days on a laptop)")
     add("--expert", help="expert file, or a folder with expert.npz and replay.npz [data/TASK]")
-    add("--replay", help="replay file [data/TASK/replay.npz]")
+    add("--replay", help="replay file [replay.npz beside the expert]")
     add("--out", help="folder for the results [runs/TASK-SEED]")
     add("--eval-seed", type=natural, default=0, help="of the evaluation episodes [0]")
     add("--evaluate-expert", action="store_true",
@@ -1975,7 +1978,7 @@ def run_command(parser, argv=None):
     try:
         result = args.run(args)
     except (UserError, MemoryError, OSError) as error:
-        if isinstance(error, OSError):
+        if isinstance(error, OSError) and error.filename:
             error = f"{error.filename}: can't be read or written: {error.strerror}"
         print(f"{parser.prog}: error: {str(error) or 'not enough memory'}", file=sys.stderr)
         return 2

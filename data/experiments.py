@@ -5,10 +5,10 @@
     python data/experiments.py figure4 --tasks walker-run --seeds 0 1 2
     python data/experiments.py report
 
-Figures 4 to 13 and `sweep` are lists of runs, each a task, a seed, a case and settings. Rows go to
-one CSV under data/results as runs end; the same command again makes those that are missing.
-`report` draws figures and tables from the CSVs alone. Table 3 is in speed.py, TAP in tap.py,
-section 5.6 in look.py. Clients of fac_tdmpc_ref.py, which knows nothing of what is here.
+Figures 4, 5, 7, 8, 12, 13, departures and `sweep` are lists of runs, each a task, a seed, a case
+and settings. Rows go to one CSV under data/results as runs end; the same command again makes those
+that are missing. `report` draws figures and tables from the CSVs alone. Table 3 is in speed.py, TAP
+in tap.py, section 5.6 in look.py. Clients of fac_tdmpc_ref.py, which knows nothing of this.
 """
 import contextlib
 import csv
@@ -50,12 +50,12 @@ def make_run(task, seed, case, **settings):
 
 def read_rows(path):
     """A CSV's rows, dicts of strings; without a line that a kill cut off."""
-    text = Path(path).read_text(encoding="utf-8") if Path(path).exists() else ""
-    if "\n" not in text:  # a kill before the first row
-        return []
-    head, *lines = [next(csv.reader([line]), []) for line in text.splitlines()]  # a cut one alone
-    fac.need(tuple(head) == ROW, f"{path}: expected the columns {','.join(ROW)}, found "
-             f"{','.join(head)}; choose another --out")
+    text = Path(path).read_text("utf-8", "replace") if Path(path).exists() else ""
+    head, *lines = text.splitlines() or [""]
+    columns = ",".join(ROW)  # of which a kill may have left a part
+    fac.need(head == columns or "\n" not in text and columns.startswith(head),
+             f"{path}: expected the columns {columns}, found {head[:200]}; choose another --out")
+    lines = [next(csv.reader([line]), []) for line in lines]  # a cut one alone
     return [dict(zip(ROW, line)) for line in lines if len(line) == len(ROW)]
 
 
@@ -254,7 +254,7 @@ def distil(task, seed, case, settings):
     distiller = distiller_of(case)(expert, fac.Replay(fac.data_file(task, "replay.npz")), config,
                                    own["num_agents"], seed)
     planning = planning_for(header, {**about, "horizon": config.horizon})
-    playing = dataclasses.replace(planning, samples=64, iterations=3)
+    playing = dataclasses.replace(planning, samples=64, iterations=3, elites=0)
     student, tap = distiller.student, case == "TAP"
     environment = None
     if tap:
@@ -817,7 +817,7 @@ def make_parser():
     add_runs("figure5", command_figure5, "Section 5.3: KL against MSE, the perturbations' "
              "deviation, the student's temperature, a consistency loss.", walkers, steps=steps,
              evaluations=4)
-    add_runs("departures", command_departures, "The differences [D2] to [D9] one at a time, "
+    add_runs("departures", command_departures, "The differences in distillation one at a time, "
              "towards the paper's values.", ["reacher-hard", "walker-walk"], steps=steps,
              evaluations=1)
     for name, run, help in (

@@ -249,6 +249,9 @@ def command_agreement(args):
     student, header, task = open_model(args)
     expert, _ = fac.load_model(args.expert or fac.data_file(task, "expert.npz"))
     fac.check_task(expert.config, task)
+    theirs, *_ = header.get("data") or [None]
+    fac.need(theirs in (None, fac.checksum(expert.params.values())), f"{args.model}: was distilled "
+             f"from another expert; name its file with --expert, and its replay with --replay")
     replay, plt = fac.Replay(args.replay or fac.data_file(task, "replay.npz")), fac.pyplot()
     rng, config = np.random.default_rng(args.seed), fac.PlannerConfig(
         **fac.made_for(header, args.model))

@@ -28,6 +28,8 @@ from numpy_learner import ExpertConfig, Learner, named, restore  # noqa: E402
 
 # for a few cores; hidden layers of 512, as in Table 2, make an update three times as dear
 TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
+NOT_ONLINE = ("steps", "batch_size", "reuse", "new_targets", "own_episodes", "own_share",
+              "held_out")  # settings of distill that say nothing where an expert still learns
 FOLLOWING_DEFAULTS = {"noise_samples": 3}
 LOSSES = ("consistency", "reward", "value", "kl_reward", "kl_value")
 CURVE = ("decisions", "updates", "seconds", "exploration_std", "horizon", "return_mean",
@@ -517,7 +519,8 @@ def export(training, out, result):
     for kind, model in training.models.items():
         header, prefix = {"kind": kind, **about}, "" if kind == "expert" else "student_"
         if kind == "student":
-            header["distill"] = dataclasses.asdict(training.student.config)
+            settings = dataclasses.asdict(training.student.config)
+            header["distill"] = {k: v for k, v in settings.items() if k not in NOT_ONLINE}
         fac.save_model(out / f"{kind}.npz", model, header)
         if args.episodes:
             planning = fac.PlannerConfig(horizon=config.horizon, discount=config.discount)
@@ -602,9 +605,7 @@ def make_parser():
     fac.add_config(parser, fac.PlannerConfig, "MPPI while training", "plan-",
                    skip=("discount",))
     fac.add_config(parser, fac.DistillConfig, "The student (Algorithm 1), on the expert's batches "
-                   "and steps", "distill-", skip=("steps", "batch_size", "reuse", "new_targets",
-                                                  "own_episodes", "own_share", "held_out"),
-                   **FOLLOWING_DEFAULTS)
+                   "and steps", "distill-", skip=NOT_ONLINE, **FOLLOWING_DEFAULTS)
     parser.set_defaults(run=train)
     return parser
 

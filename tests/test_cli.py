@@ -296,6 +296,7 @@ def refused(done, *parts, program="fac_tdmpc_ref.py"):
     (["--seed", "-1"], ["--seed", "-1"]),
     (["--eval-seed", "x"], ["--eval-seed", "'x'"]),
     (["--stepz", "3"], ["--stepz"]),
+    (["--plan-samples", "512", "--plan-elites", "513"], ["elites", "at most samples (512)"]),
     (["--expert", "none.npz"], ["none.npz", "no such file"]),
     (["--replay", "none.npz"], ["none.npz", "no such file"]),
     (["--replay", "{files}/walker.npz"], ["walker.npz", "(24, 6)", "(8, 3)"]),
@@ -361,6 +362,12 @@ def test_a_student_is_no_expert(tmp_path, files, distilled):
     _, folder = distilled
     done = run(*distill_arguments(files, "--expert", folder / "student.npz"), cwd=tmp_path)
     refused(done, "student.npz", "kind", "'expert'", "'student'")
+
+
+def test_the_replay_is_the_one_beside_the_expert(tmp_path, files):
+    (tmp_path / "expert.npz").write_bytes((files / "expert.npz").read_bytes())
+    refused(run("distill", "--expert", tmp_path / "expert.npz", *TINY, cwd=tmp_path),
+            str(tmp_path / "replay.npz"), "no such file")
 
 
 # distill ------------------------------------------------------------------------------
@@ -712,6 +719,9 @@ def test_the_readme_distils_an_expert_of_one_s_own(tmp_path, monkeypatch):
     assert import_expert.main(arguments) == 0
     *_, distil = re.findall(r"```python\n(.*?)```", text, re.S)
     assert "own_episodes=0" in distil
-    exec(distil.replace("own_episodes=0", "own_episodes=0, steps=2"), {"fac": fac})
-    student, _ = fac.load_model("mine/student.npz")
+    _, arrays = fac.read_npz("mine/replay.npz", ("replay",))
+    exec(distil.replace("own_episodes=0", "own_episodes=0, horizon=2, steps=2"),
+         {"fac": fac, "o": arrays["observation"], "a": arrays["action"], "c": arrays["continues"]})
+    student, header = fac.load_model("mine/student.npz")
     assert (student.config.num_agents, student.config.dim_action) == (6, 6)
+    assert fac.made_for(header, "student.npz") == {"horizon": 2}

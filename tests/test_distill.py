@@ -108,14 +108,18 @@ def test_a_resumed_run_ends_as_an_uninterrupted_one(replay, monkeypatch, pool, o
     assert np.array_equal(whole.optimizer.vector, without.optimizer.vector) != own
 
 
-def test_a_share_of_the_states_is_the_students_own(replay):
+@pytest.mark.parametrize("task", ["", "reacher-hard"])
+def test_a_share_of_the_states_is_the_students_own(tmp_path, task):
+    """With what the policy would do there, for the target that a state has in the end [D7]."""
+    replay = write_replay(tmp_path / "replay.npz", task)
     config = fac.dataclasses.replace(CONFIG, encoder_input="observation", own_share=0.25,
                                      noise_std=1e-3, batch_size=400)
     with fresh(replay, config) as distiller:
         distiller.add(own_episodes(7, 8))
         distiller.add(own_episodes(9))
         (features,), actions, _ = distiller.batch(0)
-        own = features.min(0) >= 7
+        own = features[0] >= 7
+        assert (features[3, own] != features[0, own]).any() == bool(task)
         assert 0.18 < own.mean() < 0.32 and set(features[0, own]) == {7, 8, 9}
         expert, obs = distiller.expert, features[:, own]
         z, expected = expert.encode(obs), []
@@ -123,6 +127,9 @@ def test_a_share_of_the_states_is_the_students_own(replay):
             expected.append(expert.policy(z)[0])
             z = expert.next(z, expected[-1][None])
         assert np.abs(actions[:, :, own] - np.array(expected)[..., None]).max() < 0.01
+    with fresh(replay, fac.dataclasses.replace(config, own_episodes=2)) as distiller:
+        with pytest.raises(fac.UserError, match="own_episodes=0"):
+            next(distiller.run())
     for quarters, expected in ((0, 0), (1, 2), (2, 4), (3, 6)):
         with fresh(replay, fac.dataclasses.replace(config, own_episodes=2)) as distiller:
             distiller.optimizer.t = quarters * 75

@@ -199,8 +199,9 @@ def test_bad_runs_are_refused(tmp_path, flags, parts):
     refused(run(*flags, cwd=tmp_path), *parts)
 
 
-def test_rows_of_another_kind_are_refused(tmp_path):
-    (tmp_path / "x.csv").write_text("a,b\n1,2\n")
+@pytest.mark.parametrize("found", [b"a,b\n1,2\n", b'{"not": "rows"}', b"\xff\xfe\n"])
+def test_rows_of_another_kind_are_refused(tmp_path, found):
+    (tmp_path / "x.csv").write_bytes(found)
     with pytest.raises(fac.UserError, match="expected the columns task,seed"):
         experiments.read_rows(tmp_path / "x.csv")
 
@@ -593,3 +594,7 @@ def test_figure9_and_agreement_draw_a_model(tmp_path):
     assert len(found["held_out"]) == len(found["worst_episode"]) == 3
     assert np.abs(found["when"]).max() <= 1
     assert (tmp_path / "agreement.png").exists()
+    fac.save_model(tmp_path / "student.npz", student, {"kind": "student", "task": "reacher-hard",
+                                                       "data": [1, 2, "reacher-hard"]})
+    refused(run("agreement", "--model", "student.npz", "--expert", "expert.npz", cwd=tmp_path),
+            "another expert", "--expert")

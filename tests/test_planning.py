@@ -236,6 +236,18 @@ def test_a_dead_worker_is_reported_and_nothing_hangs():
         assert not any(process.is_alive() for process in processes)
 
 
+def test_an_interrupted_decision_ends_the_workers(monkeypatch):
+    """Their answers, unread, would be taken for those of the next decision."""
+    with fac.Planner(random_model(), fac.PlannerConfig(samples=16), workers=1) as planner:
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(planner.own, "returns", None)
+            patch.setattr(fac, "h_step_return", lambda *_, **__: (_ for _ in ()).throw(
+                KeyboardInterrupt))
+            planner.act(np.zeros(8))
+        with pytest.raises(fac.WorkerError, match="start anew"):
+            planner.act(np.zeros(8))
+
+
 SCRIPT = """
 import signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell has it ignored
