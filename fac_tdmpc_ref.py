@@ -369,8 +369,7 @@ class Adam:
     def __init__(self, arrays):
         self.vector, self.params = flatten(arrays)
         self.gradient, self.grads = flatten({k: np.zeros_like(v) for k, v in arrays.items()})
-        self.m, self.v = np.zeros_like(self.vector), np.zeros_like(self.vector)
-        self.t = 0
+        self.m, self.v, self.t = np.zeros_like(self.vector), np.zeros_like(self.vector), 0
 
     def step(self, lr, clip=np.inf):
         """params -= lr m_hat / (sqrt(v_hat) + eps) of the gradient, clipped to norm `clip`.
@@ -645,6 +644,7 @@ def perturbed_batch(expert, student, obs, actions, config, rng):
 
 
 POOL, PART = 4096, 256  # states whose expert's predictions are computed in one go, by such parts
+OWN_BUDGET = {"samples": 64, "iterations": 3, "elites": 0}  # MPPI's in own episodes [D9]
 
 
 class Distiller:
@@ -1767,7 +1767,7 @@ def load_data(args):
 def distil_and_save(distiller, args, planning, header, out):
     """Algorithm 1 to its end; writes student, curve and configuration. Returns result's part."""
     student, config, replay = distiller.student, distiller.config, distiller.replay
-    playing = dataclasses.replace(planning, samples=64, iterations=3, elites=0)
+    playing = dataclasses.replace(planning, **OWN_BUDGET)
     settings = {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
                 "distill": asdict(config),
                 "own_planner": asdict(playing) if config.own_episodes else None,

@@ -190,21 +190,21 @@ def consistency_loss(student, features, actions, targets, config, grads=None):
     tapes, encoder_tape, weight = defaultdict(list), [], 2.0
     loss, *means = fac.distill_loss(student, features, actions, targets, config, grads)
     z = student.encode_features(features, encoder_tape)
-    steps, _, batch, noise = actions.shape
-    x, end = fac.unroll(student, z, actions, steps, tapes)
+    L, _, B, K = actions.shape
+    x, end = fac.unroll(student, z, actions, L, tapes)
     n, m = student.config.num_agents, student.config.latent_dim
-    own = np.concatenate([x[:, :m, batch * noise:], end], 2)
+    own = np.concatenate([x[:, :m, B * K:], end], 2)
     goal = student.encode_features(np.ascontiguousarray(after.reshape(1, -1, after.shape[-1])
                                                         .swapaxes(1, 2)))
-    lam = np.repeat(config.lam ** np.arange(steps), batch * noise).astype(z.dtype)
-    gap, scale = own - goal, weight / (n * m * batch * noise)
+    lam = np.repeat(config.lam ** np.arange(L), B * K).astype(z.dtype)
+    gap, scale = own - goal, weight / (n * m * B * K)
     if grads is not None:
-        d_latents = (2 * scale * lam * gap).reshape(n, m, steps, -1).transpose(2, 0, 1, 3)
+        d_latents = (2 * scale * lam * gap).reshape(n, m, L, -1).transpose(2, 0, 1, 3)
         outputs = fac.run_heads(student, x, actions, tapes)
         dz = fac.predict_backward(student, tapes, [np.zeros_like(y) for y in outputs], grads,
                                   d_latents)
         fac.backward(fac.ENCODER, student.params, "_encoder", encoder_tape,
-                     dz.reshape(1, -1, batch), grads)
+                     dz.reshape(1, -1, B), grads)
     return loss + float(scale * (lam * gap ** 2).sum()), *means
 
 
@@ -254,7 +254,7 @@ def distil(task, seed, case, settings):
     distiller = distiller_of(case)(expert, fac.Replay(fac.data_file(task, "replay.npz")), config,
                                    own["num_agents"], seed)
     planning = planning_for(header, {**about, "horizon": config.horizon})
-    playing = dataclasses.replace(planning, samples=64, iterations=3, elites=0)
+    playing = dataclasses.replace(planning, **fac.OWN_BUDGET)
     student, tap = distiller.student, case == "TAP"
     environment = None
     if tap:

@@ -108,9 +108,11 @@ def benchmark_decisions(robot, workers, planning, rounds):
     ms_median, floor_ms, ratio_to_floor; and the microseconds of a hand-over to the workers."""
     _, n, *_ = ROBOTS[robot]
     obs = np.random.default_rng(0).standard_normal(ROBOTS[robot][0], fac.F32)
-    budgets = [planning] + [dataclasses.replace(planning, elites=0, **{name: value})
-                            for name, value in (("samples", 128), ("iterations", 2))  # Figure 7
-                            if getattr(planning, name) != value]
+    budgets = [planning]
+    if planning.samples != 128:  # Figure 7
+        budgets.append(dataclasses.replace(planning, samples=128, elites=0))
+    if planning.iterations != 2:
+        budgets.append(dataclasses.replace(planning, iterations=2))
     presets = {"table2": ((50, 512), (50, max(512 // n, 50))),
                "section51": ((512, 512), (512 // n, 512 // n))}
     subjects = []

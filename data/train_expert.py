@@ -317,15 +317,11 @@ class Training:
     def tests(self):
         """An evaluation's episodes and planners, with the training's budget."""
         seeds = fac.episode_seeds(self.args.seed + 1, self.args.evaluate_episodes)
-        return ([(seed, name) for name in self.models for seed in seeds],
-                {name: (model, self.planner_of(name, self.planning))
-                 for name, model in self.models.items()})
-
-    def planner_of(self, name, planning):
-        """How the expert or its student plans: a student as it was distilled to."""
-        if name == "expert":
-            return planning
-        return dataclasses.replace(planning, horizon=self.student.config.horizon)
+        planners = {"expert": (self.learner.model, self.planning)}
+        if self.student:
+            planners["student"] = self.student.model, dataclasses.replace(
+                self.planning, horizon=self.student.config.horizon)
+        return [(seed, name) for name in planners for seed in seeds], planners
 
     def learn(self):
         """One update of the expert and, on the same batch, one of the student; their LOSSES."""
@@ -523,8 +519,7 @@ def export(training, out, result):
             header["distill"] = {k: v for k, v in settings.items() if k not in NOT_ONLINE}
         fac.save_model(out / f"{kind}.npz", model, header)
         if args.episodes:
-            planning = fac.PlannerConfig(horizon=config.horizon, discount=config.discount)
-            planner = training.planner_of(kind, planning)
+            planner = fac.PlannerConfig(**fac.made_for(header, out))
             found = fac.evaluate(model, args.task, planner, args.episodes,
                                  label=f"evaluating the {kind}")
             returns = found["returns"]

@@ -238,11 +238,12 @@ def test_a_dead_worker_is_reported_and_nothing_hangs():
 
 def test_an_interrupted_decision_ends_the_workers(monkeypatch):
     """Their answers, unread, would be taken for those of the next decision."""
+    def interrupt(z):
+        raise KeyboardInterrupt
+
     with fac.Planner(random_model(), fac.PlannerConfig(samples=16), workers=1) as planner:
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            patch.setattr(planner.own, "returns", None)
-            patch.setattr(fac, "h_step_return", lambda *_, **__: (_ for _ in ()).throw(
-                KeyboardInterrupt))
+            patch.setattr(planner.own, "plan", interrupt)
             planner.act(np.zeros(8))
         with pytest.raises(fac.WorkerError, match="start anew"):
             planner.act(np.zeros(8))
