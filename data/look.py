@@ -246,15 +246,13 @@ def agreement(student, expert, obs, actions, rng, values=32):
 
 def command_agreement(args):
     """agreement: which joint's share ranks its actions as the expert's Q does, and when."""
-    student, header, task = open_model(args)
-    expert, _ = fac.load_model(args.expert or fac.data_file(task, "expert.npz"))
-    fac.check_task(expert.config, task)
+    student, header, args.task = open_model(args)
+    (expert, _, replay, _), task = fac.load_data(args), args.task
     theirs, *_ = header.get("data") or [None]
     fac.need(theirs in (None, fac.checksum(expert.params.values())), f"{args.model}: was distilled "
-             f"from another expert; name its file with --expert, and its replay with --replay")
-    replay, plt = fac.Replay(args.replay or fac.data_file(task, "replay.npz")), fac.pyplot()
-    rng, config = np.random.default_rng(args.seed), fac.PlannerConfig(
-        **fac.made_for(header, args.model))
+             f"from another expert; name it with --expert")
+    plt, rng = fac.pyplot(), np.random.default_rng(args.seed)
+    config = fac.PlannerConfig(**fac.made_for(header, args.model))
     _, held_out = replay.starts(1, header.get("distill", {}).get("held_out",
                                                                  fac.DistillConfig.held_out))
     obs, actions = replay.sequences(rng.choice(held_out, args.states), 1)

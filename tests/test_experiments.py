@@ -3,6 +3,7 @@ import dataclasses
 import importlib.util
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -589,7 +590,8 @@ def test_figure9_and_agreement_draw_a_model(tmp_path):
                           "--json", cwd=tmp_path))
     assert found["silhouette"] is not None and set(found["moments"]) == {"best", "worst"}
     assert (tmp_path / "figure9.png").read_bytes()[:4] == b"\x89PNG"
-    found = last_json(run("agreement", "--model", "student.npz", "--expert", "expert.npz",
+    shutil.copy(fac.data_file("reacher-hard", "replay.npz"), tmp_path)  # beside the expert
+    found = last_json(run("agreement", "--model", "student.npz", "--expert", ".",
                           "--episodes", "1", "--states", "8", "--json", cwd=tmp_path))
     assert len(found["held_out"]) == len(found["worst_episode"]) == 3
     assert np.abs(found["when"]).max() <= 1
