@@ -21,6 +21,7 @@ the case N = 1. There is one world model, one planner, one loss. The axes, every
     B   batch;   S   action sequences (the last axis)
     K   noise samples of the distillation loss (behind B): actions are (L, A, B, K) there
     H   horizon: H rewards, then Q;   L   actions of a sequence: H + 1 in Equations 2 and 4
+    F   features that an encoder reads;   P   proposals;   E   elites, or episodes;   T   decisions
 
 A layer is W (N, out, in), b (N, out, 1) and computes W @ x + b on x (N, in, B): samples last, so
 that activations run over long contiguous rows, and a torch Linear.weight goes in as weight[None].
@@ -28,8 +29,7 @@ Rewards and values come out as (N, B), agent i's share; the global one is their 
 
 Read it from top to bottom: 1 configuration, 2 layers, 3 world model, 4 distillation, 5 planning,
 6 environments, 7 files, 8 commands. A first reading may skip what is marked "the same, fast" and
-"the same, in processes" in section 5. Departures from the paper are tagged [D1], [D2], ...; the
-README lists them with what each bought.
+"the same, in processes" in section 5. Departures from the paper, [D1] ..., are in the README.
 """
 from __future__ import annotations
 
@@ -484,6 +484,7 @@ def networks(config, policy=False):
              ("_dynamics", MLP, n, (m + d, *hidden, m)),
              *((name, kinds, n, (m + d, *hidden, 1)) for name, kinds in HEADS)]
     if policy:
+        need(n == 1, f"a policy (_pi) needs one agent, found {n}: a plan's agents act alone")
         found.append(("_pi", MLP, n, (m, *hidden, d)))
     if latent:
         found.append(("_expert_encoder", ENCODER, 1,
@@ -508,7 +509,7 @@ def unroll(model, z, actions, transitions, tapes=None):
 
     z (N, m, B), actions (L, A, B, K): K perturbed copies of a trajectory. Returns the networks'
     input x (N, m + d, L * B * K), columns in the order (L, B, K), with s_{h+1} = f_T(s_h, a_h),
-    and the last latents (N, m, B * K) if there are L transitions (else there are L - 1)."""
+    and the last latents (N, m, B * K) of L transitions (Equation 1's; Equation 4 has L - 1)."""
     L, _, B, K = actions.shape
     n, m, d = model.config.num_agents, model.config.latent_dim, model.config.agent_actions
     columns = B * K
@@ -594,19 +595,19 @@ def distill_loss(student, features, actions, targets, config, grads=None, diverg
     tapes, encoder_tape = defaultdict(list), []
     z = student.encode_features(features, encoder_tape)
     outputs = predict(student, z, actions, tapes)
-    steps, batch, _ = outputs[0].shape
-    weights = (config.lam ** np.arange(steps) / batch).astype(z.dtype)[:, None]
+    L, B, _ = outputs[0].shape
+    lam = (config.lam ** np.arange(L) / B).astype(z.dtype)[:, None]
     loss, means, d_outputs = 0.0, [], []
     coefs = (config.reward_coef, config.value_coef, config.value_coef)
     for coef, output, target in zip(coefs, outputs, targets):
         kl, d_output = divergence(output, target, config.temperature_student,
                                   config.temperature_expert, config.kl)
-        loss += coef * float((weights * kl).sum())
+        loss += coef * float((lam * kl).sum())
         means.append(float(kl.mean()))
-        d_outputs.append(coef * weights[..., None] * d_output)
+        d_outputs.append(coef * lam[..., None] * d_output)
     if grads is not None:
         dz = predict_backward(student, tapes, d_outputs, grads)
-        backward(ENCODER, student.params, "_encoder", encoder_tape, dz.reshape(1, -1, batch), grads)
+        backward(ENCODER, student.params, "_encoder", encoder_tape, dz.reshape(1, -1, B), grads)
     return loss, means[0], (means[1] + means[2]) / 2
 
 
@@ -652,7 +653,7 @@ class Distiller:
 
     The expert is frozen: what it predicts for a pool of states and their perturbed actions is
     computed once and learned from `reuse` times. Two threads share that, and each step's batch:
-    NumPy lets go of the interpreter inside its products. sizes: a ModelConfig to override its."""
+    NumPy lets go of the interpreter inside its products. sizes: in place of `student_config`'s."""
 
     loss = staticmethod(distill_loss)
 
@@ -676,21 +677,20 @@ class Distiller:
         self._threads = ThreadPoolExecutor(2)
         self._halves = [flatten({k: np.zeros_like(v) for k, v in self.optimizer.params.items()})
                         for _ in range(2)]
-        self._blas = one_thread()  # until `close`, in all threads
 
     def draw(self, number, part, size):
         """Line 4 and the expert's part of line 5 for a part of a pool, as `perturbed_batch`."""
         rng = stream(self.seed, f"pool {number}", part)
         obs, actions = self.replay.sequences(rng.choice(self.train_starts, size),
                                              self.config.horizon + 1)
-        own = np.zeros(size, bool)
+        is_own = np.zeros(size, bool)
         if len(self.own):  # [D9]
-            own = rng.random(size) < self.config.own_share
-            obs[:, own] = self.own[rng.integers(len(self.own), size=own.sum())].T
+            is_own = rng.random(size) < self.config.own_share
+            obs[:, is_own] = self.own[rng.integers(len(self.own), size=is_own.sum())].T
         renew_targets(self.replay.header.get("task"), obs, self.config.new_targets, rng)
-        if own.any():
-            actions[..., own] = policy_rollout(
-                self.expert, self.expert.encode(obs[:, own]), [F32(0)] * len(actions))[:, 0]
+        if is_own.any():
+            actions[..., is_own] = policy_rollout(
+                self.expert, self.expert.encode(obs[:, is_own]), [F32(0)] * len(actions))[:, 0]
         return perturbed_batch(self.expert, self.student, obs, actions, self.config, rng)
 
     def batch(self, t):
@@ -712,21 +712,23 @@ class Distiller:
 
     def step(self):
         """Lines 4 to 6 once. Returns loss, mean reward divergence, mean value divergence."""
-        features, actions, targets = self.batch(self.t)
-
-        def learn(gradient_and_views, part):
-            return self.loss(self.student, features[..., part], actions[:, :, part],
-                                [x[:, part] for x in targets], self.config, gradient_and_views[1])
-
         size, total = self.config.batch_size, np.zeros(3)
-        parts = [slice(0, -(-size // 2)), slice(-(-size // 2), size)][:size]  # one of a batch of 1
-        for part, (gradient, _), losses in zip(parts, self._halves,
-                                               self._threads.map(learn, self._halves, parts)):
-            fraction = (part.stop - part.start) / size
-            total += fraction * np.array(losses)
-            self.optimizer.gradient += gradient.dtype.type(fraction) * gradient
-            gradient[:] = 0
-        self.optimizer.step(learning_rate(self.config, self.t), self.config.grad_clip)
+        half = (size + 1) // 2
+        parts = [slice(0, half), slice(half, size)][:size]  # one of a batch of 1
+
+        def learn(part, grads):
+            return self.loss(self.student, features[..., part], actions[:, :, part],
+                             [x[:, part] for x in targets], self.config, grads)
+
+        with one_thread():
+            features, actions, targets = self.batch(self.t)
+            found = self._threads.map(learn, parts, (grads for _, grads in self._halves))
+            for part, (gradient, _), losses in zip(parts, self._halves, found):
+                fraction = (part.stop - part.start) / size
+                total += fraction * np.array(losses)
+                self.optimizer.gradient += gradient.dtype.type(fraction) * gradient
+                gradient[:] = 0
+            self.optimizer.step(learning_rate(self.config, self.t), self.config.grad_clip)
         return tuple(total.tolist())
 
     def run(self, play=None):
@@ -762,9 +764,8 @@ class Distiller:
         self.own, self._number = state["own"], None
 
     def close(self):
-        """Stop the threads and give BLAS its own back."""
+        """Stop the threads."""
         self._threads.shutdown(wait=True, cancel_futures=True)
-        self._blas.restore_original_limits()
 
 
 def spearman(x, y):
@@ -791,9 +792,10 @@ def rank_correlation(distiller, states, discount=0.99):
     rng = stream(distiller.seed, "rank correlation")
     starts = rng.choice(distiller.held_out_starts, states)
     student, config = distiller.student, dataclasses.replace(distiller.config, noise_samples=32)
-    sequences = distiller.replay.sequences(starts, config.horizon + 1)
-    features, actions, expert = perturbed_batch(distiller.expert, student, *sequences, config, rng)
-    own = predict(student, student.encode_features(features), actions)
+    obs, actions = distiller.replay.sequences(starts, config.horizon + 1)
+    with one_thread():
+        x, actions, expert = perturbed_batch(distiller.expert, student, obs, actions, config, rng)
+        own = predict(student, student.encode_features(x), actions)
     return (spearman(expert[1] + expert[2], own[1] + own[2]).mean(-1),
             spearman(*(horizon_returns(*out, discount) for out in (expert, own))).mean(-1))
 
@@ -822,9 +824,9 @@ def mppi(returns, mean, config, rngs, proposals=None):
 
     returns: (N, L, d, S) actions -> (N, S); mean (N, L, d): the proposal to start from; rngs:
     one Generator for each agent; proposals (N, L, d, P): sequences that compete in every
-    iteration. Elites are chosen agent by agent, which Proposition 1 allows: with N = 1 this is
-    centralized MPPI. Returns the new mean (N, L, d), the last elites (N, L, d, E) and their
-    scores (N, E), which sum to 1."""
+    iteration. Elites are chosen agent by agent: G is a sum of G_i(a_i), so the best of each is
+    the best of all (Proposition 1). N = 1 is centralized MPPI. Returns the new mean (N, L, d), the
+    last elites (N, L, d, E) and their scores (N, E), which sum to 1."""
     mean, std = mean[..., None], F32(config.max_std)
     if proposals is not None:
         G_proposals = returns(proposals)
@@ -852,6 +854,13 @@ def mppi(returns, mean, config, rngs, proposals=None):
         std = np.clip(std, config.min_std, config.max_std)
         mean = config.momentum * mean + (1 - config.momentum) * new
     return mean[..., 0], elites, scores
+
+
+def draw_elite(elites, scores, rngs):
+    """The first actions (N, d) of one elite of each agent, drawn by score (TD-MPC's code)."""
+    pick = [min(np.searchsorted(np.cumsum(p), rng.random(), "right"), len(p) - 1)
+            for p, rng in zip(scores, rngs)]
+    return np.stack([e[0, :, i] for e, i in zip(elites, pick)])
 
 
 POLICY_STD, POLICY_CUT = 0.05, 0.3  # TD-MPC's policy noise: its deviation, and where it is cut
@@ -884,11 +893,7 @@ class AgentPlanner:
                    functools.partial(h_step_return, self.model, z, config=config))
         mean, elites, scores = mppi(returns, self.mean, config, self.rngs, self._proposals(z))
         self.mean = np.concatenate([mean[:, 1:], np.zeros_like(mean[:, :1])], 1)
-        if config.output == "mean":
-            return mean[:, 0]
-        pick = [min(np.searchsorted(np.cumsum(p), rng.random(), "right"), len(p) - 1)
-                for p, rng in zip(scores, self.rngs)]
-        return np.stack([e[0, :, i] for e, i in zip(elites, pick)])
+        return mean[:, 0] if config.output == "mean" else draw_elite(elites, scores, self.rngs)
 
     def _proposals(self, z):
         """Noisy policy rollouts (1, L, A, P), where there is a policy (TD-MPC's code)."""
@@ -1068,9 +1073,7 @@ def split_agents(agents, workers):
 
 def cores():
     """Cores that this process may use, where the system tells (taskset, containers)."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def useful_workers(agents):
@@ -1120,7 +1123,8 @@ class Workers(contextlib.AbstractContextManager):
         try:  # plain pickle: the connection's own takes half of a hand-over
             self._members[i][1].send_bytes(pickle.dumps(message))
         except (BrokenPipeError, ConnectionResetError):
-            self.receive(i)  # raises what it ended with
+            while True:  # past answers left unread, to what it ended with
+                self.receive(i)
 
     def receive(self, i):
         """The next message of worker i; WorkerError as soon as it has died."""
@@ -1135,11 +1139,6 @@ class Workers(contextlib.AbstractContextManager):
             self.close()
             raise message
         return message
-
-    def send_all(self, message):
-        """Send to every worker."""
-        for i in range(len(self._members)):
-            self.send(i, message)
 
     def receive_all(self):
         """The next message of every worker, in their order."""
@@ -1178,7 +1177,7 @@ def _thread_pools():
 
 
 def one_thread():
-    """BLAS uses one thread from now on: a context, or until its restore_original_limits()."""
+    """A context in which BLAS uses one thread."""
     return _thread_pools().limit(limits=1, user_api="blas")
 
 

@@ -189,9 +189,7 @@ class Run:
             return imagined_return(self.model, state, actions, self.config.discount)
         mean, elites, scores = fac.mppi(returns, self.mean, self.config, self.rngs)
         self.mean = np.concatenate([mean[:, 1:], np.zeros_like(mean[:, :1])], axis=1)
-        draw = np.array([[rng.random()] for rng in self.rngs])  # (N, 1)
-        chosen = (np.cumsum(scores, axis=1)[:, :-1] < draw).sum(axis=1)  # (N,), scores (N, E)
-        return elites[np.arange(len(chosen)), 0, :, chosen]
+        return fac.draw_elite(elites, scores, self.rngs)
 
     def step(self):
         """Plan and move. The arm itself is the joints and the actuator, whatever the model."""

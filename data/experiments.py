@@ -224,8 +224,8 @@ class ConsistentDistiller(fac.Distiller):
 
 
 class SmallDistiller(fac.Distiller):
-    """B.2's 10% TD-MPC: centralized, hidden layers of 66 (9% of the weights with latents of 512,
-    3% with Table 2's of 50)."""
+    """B.2's 10% TD-MPC: centralized, hidden layers of 66 (behind the encoder 8% of the weights
+    with latents of 512, 3% with Table 2's of 50)."""
 
     def __init__(self, expert, replay, config, num_agents=1, seed=0):
         sizes = fac.student_config(expert.config, 1, config.sizes, config.encoder_input)
@@ -739,7 +739,7 @@ REPORT_HEAD = """# The paper's figures, here
 Written by `python data/experiments.py report` from the CSVs beside it; README.md says what they
 show. Returns: mean ± deviation over seeds (their number; one without), then the rank correlation of
 G; every run's settings are in its CSV. '10% TD-MPC' has hidden layers of 66 (B.2), which with
-Table 2's latents of 50 is 3% of the weights; six factored agents have 26%.
+Table 2's latents of 50 is 3% of the weights behind the encoder; six factored agents have 26%.
 
 """
 REPORTS = {"figure4": report_curves, "figure5": report_curves, "figure7": report_figure7,

@@ -57,30 +57,30 @@ def equation_1(model, obs, actions, reward, latents, td, config, grads=None):
         1/H sum_{h=0}^{H-1} lambda^h [c_T |s_{h+1} - latents_h|^2 + c_R (r_h - reward_h)^2
                             + c_Q ((Q1_h - td_h)^2 + (Q2_h - td_h)^2)],  means over B and m,
 
-    as TD-MPC's code has it (the paper prints h = 0..H, no 1/H, and norms).
+    as TD-MPC's code has it (the paper prints h = 0..H, sums over m, one Q, no coefficients, no 1/H).
 
     obs (O, B): the first ones; actions (H, A, B); reward (H, B); latents and td from `td_targets`.
     Returns the loss, its three sums over h without coefficients, and the rollout s_0, ..., s_H
     (1, m, (H + 1) * B)."""
-    steps, _, batch = actions.shape
+    H, _, B = actions.shape
     tapes, encoder_tape, actions = defaultdict(list), [], actions[..., None]  # K = 1
     z = model.encode_features(obs[None], encoder_tape)
-    x, end = fac.unroll(model, z, actions, steps, tapes)
+    x, end = fac.unroll(model, z, actions, H, tapes)
     rollout = np.concatenate([x[:, :z.shape[1]], end], 2)
-    weights = (config.lam ** np.arange(steps) / batch).astype(z.dtype)[:, None]
+    lam = (config.lam ** np.arange(H) / B).astype(z.dtype)[:, None]
     terms, d_outputs = [], []
     coefs = (config.reward_coef, config.value_coef, config.value_coef)
     for coef, output, goal in zip(coefs, fac.run_heads(model, x, actions, tapes), (reward, td, td)):
         error = output[..., 0] - goal
-        terms.append(float((weights * error ** 2).sum()))
-        d_outputs.append((2 * coef / steps * weights * error)[..., None])
-    gap = (rollout[:, :, batch:] - latents).reshape(*z.shape[:2], steps, batch)
-    weights = weights / z.shape[1]
-    terms.insert(0, float((weights * gap ** 2).sum()))
+        terms.append(float((lam * error ** 2).sum()))
+        d_outputs.append((2 * coef / H * lam * error)[..., None])
+    gap = (rollout[:, :, B:] - latents).reshape(*z.shape[:2], H, B)
+    lam = lam / z.shape[1]
+    terms.insert(0, float((lam * gap ** 2).sum()))
     terms = [terms[0], terms[1], terms[2] + terms[3]]
-    loss = np.dot(terms, [config.consistency_coef, config.reward_coef, config.value_coef]) / steps
+    loss = np.dot(terms, [config.consistency_coef, config.reward_coef, config.value_coef]) / H
     if grads is not None:
-        d_latents = 2 * config.consistency_coef / steps * weights * gap
+        d_latents = 2 * config.consistency_coef / H * lam * gap
         dz = fac.predict_backward(model, tapes, d_outputs, grads, d_latents.transpose(2, 0, 1, 3))
         fac.backward(fac.ENCODER, model.params, "_encoder", encoder_tape, dz, grads)
     return float(loss), terms, rollout
@@ -97,14 +97,14 @@ def policy_loss(model, rollout, noise, lam, grads):
     x = np.concatenate([rollout, a], 1)
     q1, q2 = (fac.forward(fac.QNET, model.params, name, x, q_tape)
               for name, q_tape in zip(("_Q1", "_Q2"), q_tapes))
-    weights = np.repeat(lam ** np.arange(steps) / batch, batch).astype(x.dtype)
+    lam = np.repeat(lam ** np.arange(steps) / batch, batch).astype(x.dtype)
     first = np.where(q1 == q2, fac.F32(0.5), q1 < q2).astype(x.dtype)  # a tie counts half for each
     da = 0
     for name, q_tape, smaller in (("_Q1", q_tapes[0], first), ("_Q2", q_tapes[1], 1 - first)):
-        dx = fac.backward(fac.QNET, model.params, name, q_tape, -weights * smaller, None)
+        dx = fac.backward(fac.QNET, model.params, name, q_tape, -lam * smaller, None)
         da = da + dx[:, rollout.shape[1]:]
     fac.backward(fac.MLP, model.params, "_pi", tape, fac.tanh_backward(da, mu), grads)
-    return -float((weights * np.minimum(q1, q2)).sum())
+    return -float((lam * np.minimum(q1, q2)).sum())
 
 
 class Learner:

@@ -42,11 +42,13 @@ class Predictor:
         self._x = np.random.default_rng(0).standard_normal(
             (sizes.num_agents, sizes.latent_dim + sizes.agent_actions, TABLE3_BATCH), fac.F32)
         self._workers = fac.Workers(_prediction_worker, workers, "prediction worker")
+        self._count = workers
         for i, share in enumerate(theirs):
             self._workers.send(i, model.agents(share.start, share.stop))
 
     def __call__(self, function):
-        self._workers.send_all(function)
+        for i in range(self._count):
+            self._workers.send(i, function)
         kinds = fac.QNET if function == "f_Q" else fac.MLP
         for name in FUNCTIONS[function]:
             fac.forward(kinds, self.model.params, name, self._x)
@@ -135,7 +137,7 @@ def benchmark_decisions(robot, workers, planning, rounds):
             [gemm, *(functools.partial(subject[-1], obs) for subject in subjects)], rounds,
             f"{robot}: decisions")
         echo = stack.enter_context(fac.Workers(_echo_worker, workers, "echo worker"))
-        hand_over = fac.interleaved_seconds([functools.partial(wake, echo)], 200,
+        hand_over = fac.interleaved_seconds([functools.partial(wake, echo, workers)], 200,
                                             f"{robot}: hand-over")
     multiply_add = float(np.median(seconds[:, 0])) / 512 ** 3
     rows = []
@@ -148,9 +150,10 @@ def benchmark_decisions(robot, workers, planning, rounds):
     return rows, 1e6 * float(np.median(hand_over)) if workers else None
 
 
-def wake(workers):
+def wake(workers, count, message=None):
     """Wake all workers and wait for their answers, without planning: what a plan pays."""
-    workers.send_all(None)
+    for i in range(count):
+        workers.send(i, message)
     workers.receive_all()
 
 

@@ -101,7 +101,7 @@ class Actors:
     def __init__(self, task, workers):
         fac.lookup_task(task)
         self._workers, self._count = fac.Workers(_acting_worker, workers, "acting worker"), workers
-        self._workers.send_all(task)
+        self._send_all(task)
 
     def begin(self, episodes):
         """Start episodes: (seed, player, exploration_std) of each."""
@@ -111,7 +111,11 @@ class Actors:
 
     def play(self, decisions, planners):
         """Let all go on, players with newer planners {player: (model, planner config)}."""
-        self._workers.send_all(("play", decisions, planners))
+        self._send_all(("play", decisions, planners))
+
+    def _send_all(self, message):
+        for i in range(self._count):
+            self._workers.send(i, message)
 
     def wait(self):
         """Until they have; (observations, actions, rewards) of every episode so far."""
