@@ -53,6 +53,7 @@ import zlib
 from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from multiprocessing import resource_tracker
 from pathlib import Path
 
 import numpy as np
@@ -83,7 +84,8 @@ def field(default, help, **about):
 
 
 RANGE = {"least": ("at least {}", operator.ge), "above": ("above {}", operator.gt),
-         "most": ("at most {}", operator.le)}
+         "most": ("at most {}", operator.le),
+         "choices": ("one of {}", lambda value, choices: value in choices)}
 
 
 class Settings:
@@ -94,9 +96,6 @@ class Settings:
             value = getattr(self, f.name)
             rules = [(words.format(f.metadata[bound]), holds(value, f.metadata[bound]))
                      for bound, (words, holds) in RANGE.items() if bound in f.metadata]
-            if "choices" in f.metadata:
-                choices = f.metadata["choices"]
-                rules.append((f"one of {', '.join(choices)}", value in choices))
             if isinstance(value, float):
                 rules.append(("finite", np.isfinite(value)))
             if not all(holds for _, holds in rules):
@@ -112,7 +111,7 @@ class Settings:
 class ModelConfig(Settings):
     """Sizes of a world model. Raises UserError if the agents don't share the actions evenly."""
     dim_obs: int = field(0, "O: observation features")
-    dim_action: int = field(0, "A: action dimensions")
+    dim_action: int = field(0, "A: action dimensions", most=1_000_000)
     num_agents: int = field(1, "N: 1 is TD-MPC, A is Fac-TDMPC")
     latent_dim: int = field(50, "m: latent features of an agent (Table 2)", least=1)
     enc_dim: int = field(256, "hidden width of the encoder (Table 2)", least=1)
@@ -201,7 +200,7 @@ class DistillConfig(Settings):
                               "quarters, to learn from [D9]", paper=0, least=0)
     own_share: float = field(0.25, "share of states from these [D9]", paper=0.0, least=0, most=1)
     held_out: float = field(0.05, "share of episodes held out, for rank correlations",
-                            above=0, most=0.5)
+                            least=1e-4, most=0.5)
 
 
 def stream(seed, use, index=0):
@@ -1105,6 +1104,7 @@ class Workers(contextlib.AbstractContextManager):
 
     def __init__(self, target, count, name="worker"):
         context, self._name, self._members = multiprocessing.get_context("spawn"), name, []
+        resource_tracker.ensure_running()  # or the first child starts it, which unblocks SIGINT
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which a child inherits
         try:
             for _ in range(count):
@@ -1159,15 +1159,12 @@ class Workers(contextlib.AbstractContextManager):
 
 
 def _run_worker(target, connection):
-    # the mask alone is not enough: multiprocessing's resource tracker unblocks SIGINT as it starts
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        with one_thread():
-            target(connection)
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        pass  # the parent is gone or has closed the pipe
-    except UserError as error:
-        connection.send(error)
+    with contextlib.suppress(EOFError, OSError):  # the parent is gone or has closed the pipe
+        try:
+            with one_thread():
+                target(connection)
+        except UserError as error:
+            connection.send(error)
 
 
 @functools.cache
@@ -1225,9 +1222,7 @@ REACHER_XML = f"""
       </body>
     </body>
   </worldbody>
-  <actuator>
-    <motor joint="joint0"/> <motor joint="joint1"/> <motor joint="joint2"/>
-  </actuator>
+  <actuator> <motor joint="joint0"/> <motor joint="joint1"/> <motor joint="joint2"/> </actuator>
 </mujoco>
 """
 
@@ -1281,7 +1276,7 @@ class Environment:
 
 def lookup_task(task):
     """(domain, name, dim O, dim A) of a task; UserError with the nearest name otherwise."""
-    if task not in TASKS:
+    if str(task) not in TASKS:
         near = difflib.get_close_matches(str(task), TASKS, n=1, cutoff=0)
         raise UserError(f"unknown task {task!r}; did you mean {near[0]!r}? "
                         f"Known tasks: {', '.join(TASKS)}")
@@ -1359,7 +1354,7 @@ def read_npz(path, kind):
         header = json.loads(arrays.pop("header").tobytes())
         if not isinstance(header, dict):
             raise ValueError
-    except (KeyError, ValueError):
+    except (KeyError, ValueError, RecursionError):
         raise UserError(f"{path}: header: expected a JSON entry of this name, found none; files "
                         f"are made by data/train_expert.py and distill") from None
     need(header.get("format") == FORMAT, f"{path}: header: format: expected {FORMAT!r}, found "
@@ -1590,9 +1585,12 @@ def train_student(distiller, out, settings, playing, workers):
     checkpoint, config, curve, before = out / "checkpoint.npz", distiller.config, [], 0.0
     if checkpoint.exists():
         header, arrays = read_npz(checkpoint, ("checkpoint",))
-        same_settings(header["settings"], settings, checkpoint)
-        curve, before = header["curve"], header["seconds"]
-        distiller.load(arrays)
+        try:
+            same_settings(header["settings"], settings, checkpoint)
+            curve, before = header["curve"], header["seconds"]
+            distiller.load(arrays)
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(f"{checkpoint}: damaged ({error!r}); delete it to start anew") from None
     began = saved = time.time()
     every, losses = max(1, min(250, config.steps // 8)), []
     with progress("distilling", config.steps, "step", distiller.t) as bar:
@@ -1627,15 +1625,14 @@ def check_finite(values, update, lr):
 
 
 def same_settings(found, expected, where):
-    """UserError if a checkpoint was made with other settings (dicts, whose values may be dicts)."""
+    """UserError if a file is of a run with other settings (dicts, whose values may be dicts)."""
     for key in {**found, **expected}:
         values = found.get(key), expected.get(key)
         if all(isinstance(value, dict) for value in values):
             same_settings(*values, where)
         else:
-            need(values[0] == values[1], f"{where}: an unfinished run with other settings ({key}: "
-                 f"expected {values[1]}, found {values[0]}); finish it with its own, delete it, or "
-                 f"choose another --out")
+            need(values[0] == values[1], f"{where}: a run with other settings ({key}: expected "
+                 f"{values[1]}, found {values[0]}); delete it, or choose another --out")
 
 
 def write_curve(path, columns, rows):
@@ -1773,6 +1770,9 @@ def distil_and_save(distiller, args, planning, header, out):
                 "data": [checksum(distiller.expert.params.values()),
                          checksum([replay.observation, replay.action, replay.ends]),
                          replay.header.get("task")]}
+    if (path := out / "student.npz").exists():  # a run that this one would replace
+        before, _ = read_npz(path, ("student",))
+        same_settings({key: before.get(key) for key in settings}, settings, path)
     print(f"{args.task}: {student.config.num_agents} agents, {len(distiller.optimizer.vector):,} "
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
@@ -1859,9 +1859,10 @@ def command_evaluate(args):
     """evaluate: a model's returns on a task."""
     model, header = load_model(args.model)
     planning = from_args(PlannerConfig, args, **made_for(header, args.model))
-    task = args.task or header.get("task")
+    need(task := args.task or header.get("task"), f"{args.model}: header: no task; pass --task")
     need(task == header.get("task") or not args.record, f"{args.model}: header: task: expected "
          f"{task!r} to record its returns, found {header.get('task')!r}")
+    read_records(args.model)  # which --record adds to: what is damaged is missed now
     found = evaluate(model, task, planning, args.episodes, args.seed, args.workers)
     returns, ms = found["returns"], found["plan_ms_median"]
     if args.record:
@@ -1908,10 +1909,10 @@ def paper_preset(config_class):
 
 
 def natural(text, least=0):
-    """argparse type: a whole number, 0 (or `least`) or more."""
-    if not (text.isdecimal() and int(text) >= least):
-        raise argparse.ArgumentTypeError(f"expected a whole number, at least {least}, found "
-                                         f"{text!r}")
+    """argparse type: a whole number, 0 (or `least`) or more, of at most nine digits."""
+    if not (text.isdecimal() and least <= int(text) < 10 ** 9):
+        raise argparse.ArgumentTypeError(f"expected a whole number, at least {least} and below "
+                                         f"10^9, found {text!r}")
     return int(text)
 
 
@@ -1987,7 +1988,7 @@ def run_command(parser, argv=None):
         return 130
     if args.json:
         print(json.dumps(result))
-    return 0
+    return 1 if result and result.get("failed") else 0  # an experiment's runs
 
 
 def main(argv=None):

@@ -12,6 +12,7 @@ in tap.py, section 5.6 in look.py. Clients of fac_tdmpc_ref.py, which knows noth
 """
 import contextlib
 import csv
+import ctypes
 import dataclasses
 import functools
 import io
@@ -56,7 +57,15 @@ def read_rows(path):
     fac.need(head == columns or "\n" not in text and columns.startswith(head),
              f"{path}: expected the columns {columns}, found {head[:200]}; choose another --out")
     lines = [next(csv.reader([line]), []) for line in lines]  # a cut one alone
-    return [dict(zip(ROW, line)) for line in lines if len(line) == len(ROW)]
+    rows = [dict(zip(ROW, line)) for line in lines if len(line) == len(ROW)]
+    for row in rows:
+        try:
+            numbers = [float(row[key] or 0) for key in ROW[4:-1]]
+            fac.need(np.isfinite(numbers).all() and json.loads(row["settings"]).items, "")
+        except (ValueError, AttributeError, fac.UserError):
+            raise fac.UserError(f"{path}: expected numbers from {ROW[4]} on and settings as JSON, "
+                                f"found {','.join(row.values())[:200]}; delete the line") from None
+    return rows
 
 
 def append_rows(path, rows):
@@ -93,6 +102,8 @@ def attempt(function, run, home):
     """A run's rows; one that fails is a row with its error. home: the process that waits."""
     if home != os.getpid():
         os.environ["TQDM_DISABLE"] = "1"  # a worker's own bars
+        if os.getppid() == home and sys.platform == "linux":  # ends with it
+            ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG, SIGKILL
     began = time.time()
     with fac.one_thread():
         try:
@@ -115,10 +126,12 @@ def run_all(args, function, runs):
     runs = list({tuple(run.values()): run for run in runs}.values())
     todo = [run for run in runs if tuple(run.values()) not in done]
     failed, where = [], connect(args)
+    append_rows(path, [])  # what can't be written is missed now
     with fac.progress(args.command, len(runs), "run", len(runs) - len(todo)) as bar, \
             joblib.parallel_config(**where):
-        parallel = joblib.Parallel(args.jobs, return_as="generator_unordered", batch_size=1,
-                                   pre_dispatch="n_jobs")  # a kill leaves no queue behind
+        parallel = joblib.Parallel(  # a kill leaves no queue behind
+            max(1, min(args.jobs, len(todo))), return_as="generator_unordered", batch_size=1,
+            pre_dispatch="n_jobs")
         try:
             for rows in parallel(joblib.delayed(attempt)(function, run, os.getpid())
                                  for run in todo):
@@ -224,8 +237,7 @@ class ConsistentDistiller(fac.Distiller):
 
 
 class SmallDistiller(fac.Distiller):
-    """B.2's 10% TD-MPC: centralized, hidden layers of 66 (behind the encoder 8% of the weights
-    with latents of 512, 3% with Table 2's of 50)."""
+    """B.2's 10% TD-MPC: centralized, hidden layers of 66 (3% of the weights behind the encoder)."""
 
     def __init__(self, expert, replay, config, num_agents=1, seed=0):
         sizes = fac.student_config(expert.config, 1, config.sizes, config.encoder_input)
@@ -403,9 +415,8 @@ def plan_with(task, seed, case, settings, students):
     robot that `joint` and `kind` disturb. students: a folder, see `load`."""
     model, header = load(task, seed, case, students)
     planning = planning_for(header, settings)
-    environment = None
-    if settings.get("kind"):
-        environment = DisturbedEnvironment(task, settings["joint"], settings["kind"])
+    environment = (DisturbedEnvironment(task, settings["joint"], settings["kind"])
+                   if settings.get("kind") else None)
     seeds = fac.episode_seeds(0, settings["episodes"])
     yield summary(episodes(model, task, planning, seeds, environment)[1])
 
@@ -640,7 +651,8 @@ def report_curves(name, path, figures):
         for row in table:
             ratio, lags = follow_up(rows, row[0])
             result[row[0]].update(ratio=ratio, lag=lags)
-            row[-1:] = [f"{ratio:.2f}", "; ".join(" / ".join(map(str, x)) for x in lags)]
+            lags = "; ".join(" / ".join(map(str, x)) for x in lags)
+            row[-1:] = ["-" if ratio is None else f"{ratio:.2f}", lags]
     return result, markdown(heads, table)
 
 
@@ -651,7 +663,8 @@ def follow_up(rows, task):
     runs = [[{"decisions": int(r["step"]), "eval_student": float(r["return_mean"]),
               "eval_expert": float(r["expert_mean"])} for r in own if r["step"]]
             for (t, *_), own in rows.items() if t == task]
-    return (float(np.mean([run[-1]["eval_student"] / run[-1]["eval_expert"] for run in runs])),
+    ratios = [fac.return_kept(run[-1]["eval_student"], run[-1]["eval_expert"]) for run in runs]
+    return (float(np.mean(ratios)) if None not in ratios else None,
             [[lag(run, p) for p in (0.5, 0.75, 0.9)] for run in runs])
 
 
@@ -739,7 +752,7 @@ REPORT_HEAD = """# The paper's figures, here
 Written by `python data/experiments.py report` from the CSVs beside it; README.md says what they
 show. Returns: mean ± deviation over seeds (their number; one without), then the rank correlation of
 G; every run's settings are in its CSV. '10% TD-MPC' has hidden layers of 66 (B.2), which with
-Table 2's latents of 50 is 3% of the weights behind the encoder; six factored agents have 26%.
+Table 2's latents of 50 is 3% of the weights behind the encoder; six agents have 26%.
 
 """
 REPORTS = {"figure4": report_curves, "figure5": report_curves, "figure7": report_figure7,
@@ -757,8 +770,7 @@ def command_report(args):
             result[name], table = make(name, results / f"{name}.csv", figures)
             title = name.replace("figure", "Figure ").capitalize()
             text.append(f"## {title}\n\n{table}\n![]({figures_from}/{name}.png)\n")
-    fac.need(result, f"{results}: no runs there; make some, e.g. 'python data/experiments.py "
-             f"figure4'")
+    fac.need(result, f"{results}: no runs there; make some, e.g. with 'experiments.py figure4'")
     with fac.atomic_file(results / "report.md", "w", encoding="utf-8") as file:
         file.write(REPORT_HEAD + "\n".join(text))
     print("\n".join(text) + f"\n{results / 'report.md'}, {figures}/")
@@ -773,7 +785,7 @@ def make_parser():
     parser = fac.Parser(prog="experiments.py", description="The paper's tables and figures, each "
                         "by one command.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="EXPERIMENT")
-    positive = functools.partial(fac.natural, least=1)
+    positive, several = (functools.partial(fac.natural, least=n) for n in (1, 2))
     sub = fac.add_command(
         commands, "table3", command_table3, "Planning speed: Table 3 (the networks) and whole "
         "decisions, centralized and factored, by threads and processes.",
@@ -833,8 +845,8 @@ def make_parser():
     add_runs("figure13", command_figure13, "Appendix C.2: the number of agents.", walkers,
              steps=steps, evaluations=4)
     for name in ("figure7", "figure13"):
-        commands.choices[name].add_argument("--rounds", type=positive, default=20,
-                                            help="timings of each [20]")
+        add = commands.choices[name].add_argument
+        add("--rounds", type=positive, default=20, help="timings of each [20]")
     sub = add_runs("sweep", command_sweep, "A grid over any settings of distill.",
                    ["reacher-hard"], steps=steps, evaluations=1)
     sub.add_argument("--set", nargs="+", required=True, metavar="SETTING=VALUE,...",
@@ -856,10 +868,8 @@ def make_parser():
     sub.add_argument("--task", help="one of: " + ", ".join(fac.TASKS) + " [the model's own]")
     sub.add_argument("--seed", type=fac.natural, default=0, help="of the evaluation [0]")
     sub.add_argument("--episode", type=fac.natural, default=0, help="of that evaluation [0]")
-    sub.add_argument("--decisions", type=positive, default=150,
-                     help="[150]")
-    sub.add_argument("--every", type=positive, default=2,
-                     help="decisions between two frames [2]")
+    sub.add_argument("--decisions", type=positive, default=150, help="[150]")
+    sub.add_argument("--every", type=positive, default=2, help="decisions between two frames [2]")
     sub.add_argument("--out", required=True, help="a .gif or an .mp4 file")
     for name, run, help, episodes in (
             ("figure9", command_figure9, "Section 5.6: latents by joint (t-SNE, PCA), and each "
@@ -876,7 +886,7 @@ def make_parser():
     sub.add_argument("--expert", help="the expert's file or folder [data/TASK]")
     sub.add_argument("--replay", help="[replay.npz beside the expert]")
     sub.add_argument("--states", type=positive, default=256, help="held-out ones [%(default)s]")
-    commands.choices["figure9"].add_argument("--points", type=positive, default=500,
+    commands.choices["figure9"].add_argument("--points", type=several, default=500,
                                              help="states that are drawn [%(default)s]")
     return parser
 

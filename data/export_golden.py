@@ -7,7 +7,6 @@ writes data/TASK/golden.npz for an expert and a replay that lie beside it (all t
 them), and data/golden-narrow.npz, small random networks. tests/test_golden.py holds the NumPy code
 to them without PyTorch. Each file keeps its inputs, float32, beside what comes out of them.
 """
-import argparse
 import dataclasses
 import sys
 from pathlib import Path
@@ -208,7 +207,8 @@ def write_golden(folder):
     """golden.npz of the expert and the replay in a folder."""
     path, rng = folder / "expert.npz", np.random.default_rng(0)
     expert, header = fac.load_model(path)
-    config = fac.from_dict(ExpertConfig, header["training"], f"{path}: header: training")
+    config = fac.from_dict(ExpertConfig, header.get("training", {}),
+                           f"{path}: header: training")
     planner = fac.PlannerConfig(samples=64, elites=8, pi_trajs=0)
     distill = fac.DistillConfig(batch_size=8, noise_samples=10, **AS_PRINTED)
     sizes = fac.student_config(expert.config, expert.config.dim_action, distill.sizes, "latent")
@@ -272,21 +272,26 @@ def write_narrow_golden(path):
                   {**g, **{k: v.astype(np.float32) for k, v in found.items()}})
 
 
+def run(args):
+    """Write the golden files of the tasks, and that of narrow networks."""
+    fac.need(torch, "golden files hold what PyTorch computes: pip install torch")
+    fac.need(args.data.is_dir(), f"{args.data}: no such folder")
+    tasks = args.tasks or sorted(p.parent.name for p in args.data.glob("*/expert.npz"))
+    for task in tasks:
+        write_golden(args.data / task)
+    write_narrow_golden(args.data / "golden-narrow.npz")
+    return {"data": str(args.data), "tasks": tasks}
+
+
 def main(argv=None):
     """Run the command line; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="export_golden.py", description=__doc__.split("\n")[0])
+    parser = fac.Parser(prog="export_golden.py", description=(__doc__ or "").split("\n")[0])
+    parser.set_defaults(run=run)
     parser.add_argument("tasks", nargs="*", metavar="TASK", help="[all that have an expert]")
     parser.add_argument("--data", type=Path, default=fac.DATA, help="their folder [data/]")
-    args = parser.parse_args(argv)
-    try:
-        fac.need(torch, "golden files hold what PyTorch computes: pip install torch")
-        for task in args.tasks or sorted(p.parent.name for p in args.data.glob("*/expert.npz")):
-            write_golden(args.data / task)
-        write_narrow_golden(args.data / "golden-narrow.npz")
-    except fac.UserError as error:
-        print(f"export_golden.py: error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    parser.add_argument("--json", action="store_true",
+                        help="print one JSON object as the last line of stdout")
+    return fac.run_command(parser, argv)
 
 
 if __name__ == "__main__":

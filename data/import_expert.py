@@ -22,6 +22,7 @@ import math
 import pickletools
 import re
 import sys
+import tempfile
 import zipfile
 from collections import namedtuple
 from pathlib import Path
@@ -414,16 +415,21 @@ def run(args):
     sizes, weights, kinds = find_expert(args.file, args.task)
     arrays = find_replay(args.replay, sizes) if args.replay else None
     out, about = Path(args.out), {"task": args.task, "imported_from": Path(args.file).name}
-    fac.write_npz(out / "expert.npz",
-                  {"kind": "expert", "model": dataclasses.asdict(sizes), **about}, weights)
+    header = {"kind": "expert", "model": dataclasses.asdict(sizes), **about}
+    for source, name in ((args.file, "expert.npz"), (args.replay, "replay.npz")):
+        need(not source or Path(source).resolve() != (out / name).resolve(),
+             f"{source}: would be replaced by what is made of it; choose another --out")
+    if environment and not arrays:
+        with tempfile.TemporaryDirectory() as scratch:  # an expert is replaced with its replay
+            fac.write_npz(path := Path(scratch) / "expert.npz", header, weights)
+            buffer = collect(fac.load_model(path)[0], environment, args.collect, args.seed)
+    fac.write_npz(out / "expert.npz", header, weights)
     result = {"task": args.task, "file": args.file, "out": args.out, "stored_as": kinds,
               "weights": sum(w.size for w in weights.values()), "policy": "_pi.0.weight" in weights,
               "model": dataclasses.asdict(sizes), "episodes": 0, "transitions": 0, "returns": None}
     if arrays:
         fac.write_npz(out / "replay.npz", {"kind": "replay", **about}, arrays, compress=True)
     elif environment:
-        model, _ = fac.load_model(out / "expert.npz")
-        buffer = collect(model, environment, args.collect, args.seed)
         buffer.write(out / "replay.npz", about)
         result["returns"] = [float(r) for r in buffer.reward.sum(1)]
     if arrays or environment:

@@ -57,7 +57,7 @@ def equation_1(model, obs, actions, reward, latents, td, config, grads=None):
         1/H sum_{h=0}^{H-1} lambda^h [c_T |s_{h+1} - latents_h|^2 + c_R (r_h - reward_h)^2
                             + c_Q ((Q1_h - td_h)^2 + (Q2_h - td_h)^2)],  means over B and m,
 
-    as TD-MPC's code has it (the paper prints h = 0..H, sums over m, one Q, no coefficients, no 1/H).
+    as TD-MPC's code has it (the paper prints h = 0..H, sums over m, one Q and no coefficients).
 
     obs (O, B): the first ones; actions (H, A, B); reward (H, B); latents and td from `td_targets`.
     Returns the loss, its three sums over h without coefficients, and the rollout s_0, ..., s_H

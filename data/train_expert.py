@@ -416,17 +416,16 @@ class Training:
     def load(self, path):
         """Go on from what `save` wrote; UserError if it is another run's."""
         header, arrays = fac.read_npz(path, ("checkpoint",))
-        fac.same_settings(header["settings"], self.settings, path)
         try:
+            fac.same_settings(header["settings"], self.settings, path)
             self.learner.load(arrays)
             if self.student:
                 restore("student", self.student.optimizer, arrays)
             self.buffer.load(arrays)
             for key in ("decisions", "allowed", "seconds", "curve"):
                 setattr(self, key, header[key])
-        except KeyError as error:
-            raise fac.UserError(f"{path}: {error.args[0]}: missing; delete the file to start anew"
-                                ) from None
+        except (KeyError, TypeError, ValueError) as error:
+            raise fac.UserError(f"{path}: damaged ({error!r}); delete it to start anew") from None
 
 
 def lag(curve, fraction):
@@ -510,8 +509,8 @@ def export(training, out, result):
     """Write replay and models with their returns, and the picture; print a table; the result."""
     args, config = training.args, training.config
     about = {"task": args.task, "seed": args.seed, "decisions": training.decisions,
-             "updates": result["updates"], "minutes": round(training.seconds / 60, 1),
-             **training.learner.about, "training": dataclasses.asdict(config),
+             "updates": result["updates"], **training.learner.about,
+             "training": dataclasses.asdict(config),
              "training_planner": dataclasses.asdict(training.planning)}
     training.buffer.write(out / "replay.npz", about,
                           max(1, args.replay // fac.EPISODE_STEPS))

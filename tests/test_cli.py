@@ -278,7 +278,7 @@ def refused(done, *parts, program="fac_tdmpc_ref.py"):
     (["--lr", "0"], ["lr", "above 0"]),
     (["--lr", "inf"], ["lr", "finite"]),
     (["--lam", "inf"], ["lam", "finite"]),
-    (["--held-out", "1"], ["held_out", "above 0 and at most 0.5"]),
+    (["--held-out", "1"], ["held_out", "at least 0.0001 and at most 0.5"]),
     (["--held-out", "0.05"], ["replay.npz", "6 episodes are too few"]),
     (["--kl", "sideways"], ["--kl", "'sideways'", "forward"]),
     (["--preset", "authors"], ["--preset", "'authors'", "paper"]),
@@ -557,7 +557,46 @@ def test_a_checkpoint_with_other_settings_is_refused(killed, files, capsys, flag
     assert (out / "checkpoint.npz").read_bytes() == before
 
 
+@pytest.mark.parametrize("spoil", [
+    lambda header, arrays: header.pop("curve"), lambda header, arrays: header.update(settings=[1]),
+    lambda header, arrays: arrays.pop("weights"),
+    lambda header, arrays: arrays.update(weights=np.zeros(3, np.float32))])
+def test_a_damaged_checkpoint_is_named(killed, files, capsys, spoil):
+    out, _ = killed
+    header, arrays = fac.read_npz(out / "checkpoint.npz", ("checkpoint",))
+    spoil(header, arrays)
+    fac.write_npz(out / "checkpoint.npz", header, arrays)
+    assert fac.main([str(a) for a in distill_arguments(files, "--out", out)]) == 2
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert "checkpoint.npz: damaged" in message and "delete it" in message
+
+
+def test_a_finished_run_is_not_replaced_by_one_with_other_settings(distilled, files, capsys):
+    folder = distilled[1]
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    arguments = distill_arguments(files, "--lr", "1e-4", "--out", folder)
+    assert fac.main([str(a) for a in arguments]) == 2
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert "student.npz: a run with other settings (lr: expected 0.0001, found 0.001)" in message
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+
+
 # evaluate and the record of the expert ------------------------------------------------
+
+def test_what_stops_several_workers_is_said_once(tmp_path, distilled):
+    done = run("evaluate", "--model", distilled[1] / "student.npz", "--episodes", "2",
+               "--workers", "2", cwd=tmp_path, env={**ONE_THREAD, "MUJOCO_GL": "garbage"})
+    assert done.returncode == 2 and "MUJOCO_GL" in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr and done.stderr.count("error:") == 1
+
+
+def test_a_model_that_names_no_task_needs_one(tmp_path, distilled, capsys):
+    model, header = fac.load_model(distilled[1] / "student.npz")
+    fac.save_model(tmp_path / "student.npz", model, {"kind": "student",
+                                                     "distill": header["distill"]})
+    assert fac.main(["evaluate", "--model", str(tmp_path / "student.npz")]) == 2
+    assert "student.npz: header: no task; pass --task" in capsys.readouterr().err
+
 
 
 def test_evaluation_does_not_depend_on_the_number_of_workers(tmp_path, distilled):

@@ -1,4 +1,5 @@
 """data/experiments.py: the paper's tables as users run them, small."""
+import contextlib
 import dataclasses
 import importlib.util
 import json
@@ -7,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -159,10 +161,56 @@ def test_a_failed_run_is_a_row_and_is_tried_again(tmp_path):
     flags = ["sweep", *SMALL, "--set", *SET, "num-agents=4,6"]
     for _ in range(2):
         done = run(*flags, "--json", cwd=tmp_path)
-        assert last_json(done)["failed"] == 1 and "num_agents" in done.stderr
+        assert done.returncode == 1 and "num_agents" in done.stderr
+        assert json.loads(done.stdout.splitlines()[-1])["failed"] == 1
     rows = experiments.read_rows(tmp_path / "sweep.csv")
     assert ["num_agents" in row["error"] for row in rows].count(True) == 2
     assert len(rows) == 3 and len(rows_of(tmp_path / "sweep.csv")) == 1
+
+
+@pytest.mark.parametrize("column, value", [
+    ("return_mean", "nan"), ("step", "x"), ("settings", "[]"), ("settings", "{")])
+def test_a_damaged_row_is_shown(tmp_path, column, value):
+    row = {**experiments.make_run("walker-run", 0, "TAP"), "step": 1, "return_mean": 2.0,
+           "minutes": 1.0}
+    experiments.append_rows(tmp_path / "figure4.csv", [row])
+    assert len(experiments.read_rows(tmp_path / "figure4.csv")) == 1
+    experiments.append_rows(tmp_path / "figure4.csv", [{**row, column: value}])
+    with pytest.raises(fac.UserError, match=r"figure4.csv: .*TAP.*delete the line"):
+        experiments.read_rows(tmp_path / "figure4.csv")
+
+
+def test_workers_end_with_the_process_that_waits_for_them(tmp_path):
+    pytest.importorskip("joblib")
+    flags = ["sweep", *SMALL[:-1], "orphan.csv", "--set", *SET, "lr=1e-3,2e-3", "--jobs", "2",
+             "--steps", "100000"]
+    process = subprocess.Popen([sys.executable, ROOT / "data" / "experiments.py", *flags],
+                               cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    def workers():
+        """Processes in this folder that have the loky workers' command line and are at a run."""
+        found = []
+        for path in Path("/proc").glob("[0-9]*/cwd"):
+            with contextlib.suppress(OSError):
+                if path.resolve() == tmp_path.resolve() and b"loky" in (
+                        path.parent / "cmdline").read_bytes():
+                    found.append(path.parent)
+        return found
+
+    if not Path("/proc/self/cmdline").exists():
+        process.kill()
+        pytest.skip("needs /proc")
+    begun = time.time()
+    while len(workers()) < 2 and time.time() - begun < 60:
+        time.sleep(0.1)
+    time.sleep(5)  # until both are at their runs
+    assert len(workers()) >= 2
+    process.kill()
+    process.wait()
+    begun = time.time()
+    while workers() and time.time() - begun < 20:
+        time.sleep(0.1)
+    assert not workers()
 
 
 def test_dask_gives_the_rows_that_processes_give(tmp_path):
@@ -596,6 +644,9 @@ def test_figure9_and_agreement_draw_a_model(tmp_path):
     assert len(found["held_out"]) == len(found["worst_episode"]) == 3
     assert np.abs(found["when"]).max() <= 1
     assert (tmp_path / "agreement.png").exists()
+    shutil.copy(fac.data_file("walker-run", "replay.npz"), tmp_path / "other.npz")
+    refused(run("agreement", "--model", "student.npz", "--expert", ".", "--replay", "other.npz",
+                cwd=tmp_path), "other.npz", "--replay")
     fac.save_model(tmp_path / "student.npz", student, {"kind": "student", "task": "reacher-hard",
                                                        "data": [1, 2, "reacher-hard"]})
     refused(run("agreement", "--model", "student.npz", "--expert", "expert.npz", cwd=tmp_path),

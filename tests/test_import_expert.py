@@ -826,3 +826,17 @@ def test_collected_episodes_distil_and_depend_on_the_seed_alone(tmp_path, capsys
     assert not np.array_equal(a.action, c.action)
     assert a.header["task"] == TASK and np.array_equal(a.ends, [20, 41, 62])
     a.starts(2, 0.33)
+
+    before = {path: path.read_bytes() for path in (tmp_path / "a").iterdir()}
+    for flags, part in (([str(tmp_path / "a" / "expert.npz")], "expert.npz: would be replaced"),
+                        ([str(model), "--replay", str(tmp_path / "a" / "replay.npz")],
+                         "replay.npz: would be replaced")):
+        assert import_expert.main([*flags, "--task", TASK, "--out", str(tmp_path / "a")]) == 2
+        assert part in capsys.readouterr().err
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+    monkeypatch.setattr(import_expert, "collect", interrupt)  # the old pair stays
+    assert import_expert.main([str(model), "--task", TASK, "--out", str(tmp_path / "a"),
+                               "--collect", "3", "--seed", "1"]) == 130
+    assert {path: path.read_bytes() for path in (tmp_path / "a").iterdir()} == before

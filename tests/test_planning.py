@@ -236,6 +236,24 @@ def test_a_dead_worker_is_reported_and_nothing_hangs():
         assert not any(process.is_alive() for process in processes)
 
 
+def test_a_dead_worker_is_reported_behind_an_answer_that_nobody_read():
+    with fac.Planner(random_model(), fac.PlannerConfig(samples=16), workers=1) as planner:
+        workers, z = planner._workers, planner.model.encode(np.zeros((8, 1), np.float32))[-1:]
+        process, connection = workers._members[0]
+        workers.send(0, z)
+        assert connection.poll(10)
+        os.kill(process.pid, signal.SIGKILL)
+        process.join()
+        with pytest.raises(fac.WorkerError, match="worker 0 ended with exit code -9"):
+            workers.send(0, z)
+
+
+def test_a_policy_needs_one_agent():
+    config = fac.ModelConfig(8, 3, 3)
+    with pytest.raises(fac.UserError, match="one agent, found 3"):
+        fac.WorldModel.create(config, np.random.default_rng(0), policy=True)
+
+
 def test_an_interrupted_decision_ends_the_workers(monkeypatch):
     """Their answers, unread, would be taken for those of the next decision."""
     def interrupt(z):
