@@ -1104,17 +1104,17 @@ class Workers(contextlib.AbstractContextManager):
 
     def __init__(self, target, count, name="worker"):
         context, self._name, self._members = multiprocessing.get_context("spawn"), name, []
-        resource_tracker.ensure_running()  # or the first child starts it, which unblocks SIGINT
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which a child inherits
-        try:
-            for _ in range(count):
-                here, there = context.Pipe()
-                process = context.Process(target=_run_worker, args=(target, there), daemon=True)
+        for _ in range(count):
+            here, there = context.Pipe()
+            process = context.Process(target=_run_worker, args=(target, there), daemon=True)
+            resource_tracker.ensure_running()  # or `start` does it, which unblocks SIGINT
+            mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a child inherits it
+            try:
                 process.start()
-                there.close()
-                self._members.append((process, here))
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+            there.close()
+            self._members.append((process, here))
 
     def send(self, i, message):
         """Send to worker i."""
