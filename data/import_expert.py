@@ -462,7 +462,7 @@ def report(result):
 
 def main(argv=None):
     """Run the command line; returns the exit status."""
-    parser = fac.Parser(prog="import_expert.py", description=__doc__.split("\n")[0])
+    parser = fac.Parser(prog="import_expert.py", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("file", metavar="FILE", help="checkpoint: " + ", ".join(READERS))
     parser.add_argument("--task", required=True, help="one of: " + ", ".join(fac.TASKS))
     parser.add_argument("--out", required=True, help="folder for expert.npz and replay.npz")

@@ -16,6 +16,7 @@ goes on with more --steps.
 """
 import contextlib
 import dataclasses
+import functools
 import sys
 import time
 from pathlib import Path
@@ -450,10 +451,7 @@ def read_settings(args):
     planning = fac.from_args(fac.PlannerConfig, args, horizon=config.horizon,
                              discount=config.discount)
     distilling = fac.from_args(fac.DistillConfig, args, **FOLLOWING_DEFAULTS)
-    for name in ("envs", "refresh", "workers", "threads", "evaluate_every", "evaluate_episodes"):
-        if getattr(args, name) < 1:
-            raise fac.UserError(f"--{name.replace('_', '-')} must be at least 1, not "
-                                f"{getattr(args, name)}")
+    fac.need(0 <= args.minutes < np.inf, f"--minutes: expected 0 or more, found {args.minutes}")
     if not planning.min_std <= config.std_start <= planning.max_std:
         raise fac.UserError(f"training: std_start must lie between the planner's min_std and "
                             f"max_std ({planning.min_std}, {planning.max_std}), not "
@@ -570,6 +568,7 @@ def make_parser():
         "fac, distil it on the way (appendix C.1).", epilog="A run that was cut off goes on when "
         "the same command is given again. Its folder is what distill takes as --expert.")
     add, natural = parser.add_argument, fac.natural
+    positive = functools.partial(natural, least=1)
     add("--task", default="reacher-easy", help="one of: " + ", ".join(fac.TASKS))
     add("--steps", type=natural, default=30_000, help="decisions in all, two environment steps "
         "each; a run that is over goes on with more [30000]")
@@ -581,11 +580,11 @@ def make_parser():
     add("--device", help="torch: cpu or cuda [cuda where there is one]")
     add("--precision", choices=("float32", "bfloat16"), default="float32", help="torch: of hidden "
         "layers' products; weights and outputs stay float32 [float32]")
-    add("--threads", type=natural, default=1, help="torch: of the updates [1]")
-    add("--envs", type=natural, default=4, help="episodes in a round [4]")
-    add("--refresh", type=natural, default=25, help="decisions that an episode goes on with the "
+    add("--threads", type=positive, default=1, help="torch: of the updates [1]")
+    add("--envs", type=positive, default=4, help="episodes in a round [4]")
+    add("--refresh", type=positive, default=25, help="decisions that an episode goes on with the "
         "same weights [D6] [25]")
-    add("--workers", type=natural, default=max(1, fac.cores() - 1), help="processes that play "
+    add("--workers", type=positive, default=max(1, fac.cores() - 1), help="processes that play "
         "them while this one learns [cores - 1]")
     add("--minutes", type=float, default=0, help="stop after the round under way by then; 0: "
         "never [0]")
@@ -595,9 +594,9 @@ def make_parser():
         "default budget; 0: none [20]")
     add("--replay", type=natural, default=100_000, help="transitions in replay.npz, the newest "
         "[100000]")
-    add("--evaluate-every", type=natural, default=4_000, help="decisions between two evaluations "
+    add("--evaluate-every", type=positive, default=4_000, help="decisions between two evaluations "
         "on the way [4000]")
-    add("--evaluate-episodes", type=natural, default=10, help="episodes in one [10]")
+    add("--evaluate-episodes", type=positive, default=10, help="episodes in one [10]")
     add("--json", action="store_true", help="print one JSON object as the last line of stdout")
     fac.add_config(parser, ExpertConfig, **TRAINING_DEFAULTS)
     fac.add_config(parser, fac.PlannerConfig, "MPPI while training", "plan-",

@@ -202,6 +202,7 @@ def test_a_killed_run_goes_on_to_the_same_result(trained, tmp_path):
     (["--lr", "0"], ["lr", "above 0"]),
     (["--lr", "inf"], ["lr", "finite"]),
     (["--updates-per-step", "nan"], ["updates_per_step", "nan"]),
+    (["--minutes", "nan"], ["--minutes", "nan"]),
     (["--mlp-dim", "0"], ["mlp_dim", "at least 1"]),
     (["--num-agents", "2"], ["[1, 3]"]),
     (["--num-agents", "0"], ["[1, 3]"]),
