@@ -170,7 +170,7 @@ class PlannerConfig(Settings):
 class DistillConfig(Settings):
     """Algorithm 1. `--preset paper` takes each field's paper value."""
     steps: int = field(14_000, "gradient steps [D1]", paper=100_000, least=1)
-    batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=1)
+    batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=2)
     noise_samples: int = field(5, "K: perturbations of each action [D1]", paper=10, least=2)
     noise_std: float = field(0.5, "deviation of the perturbations (authors' code)", above=0)
     clip_actions: bool = field(True, "clip perturbed actions to [-1, 1] [D8]", paper=False)
@@ -712,8 +712,7 @@ class Distiller:
     def step(self):
         """Lines 4 to 6 once. Returns loss, mean reward divergence, mean value divergence."""
         size, total = self.config.batch_size, np.zeros(3)
-        half = (size + 1) // 2
-        parts = [slice(0, half), slice(half, size)][:size]  # one of a batch of 1
+        parts = slice(0, size // 2), slice(size // 2, size)  # of a batch, one for each thread
 
         def learn(part, grads):
             return self.loss(self.student, features[..., part], actions[:, :, part],
