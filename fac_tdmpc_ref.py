@@ -396,6 +396,17 @@ class Adam:
         self.t = int(state["step"])
 
 
+@functools.cache
+def _thread_pools():
+    from threadpoolctl import ThreadpoolController
+    return ThreadpoolController()
+
+
+def one_thread():
+    """A context in which BLAS uses one thread: more would change bits, and cores are for agents."""
+    return _thread_pools().limit(limits=1, user_api="blas")
+
+
 # ==== 3. World model (sections 3.2 and 4.2) ===========================================
 
 
@@ -1164,17 +1175,6 @@ def _run_worker(target, connection):
                 target(connection)
         except UserError as error:
             connection.send(error)
-
-
-@functools.cache
-def _thread_pools():
-    from threadpoolctl import ThreadpoolController
-    return ThreadpoolController()
-
-
-def one_thread():
-    """A context in which BLAS uses one thread."""
-    return _thread_pools().limit(limits=1, user_api="blas")
 
 
 # ==== 6. Environments (appendix B.1) ==================================================
