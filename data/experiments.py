@@ -575,8 +575,9 @@ def draw_lines(path, panels, xlabel, **axes):
         if lines is None:
             ax.remove()
             continue
+        order = labels if len(labels) <= len(cycle) else list(lines)  # one style, one line
         for label, points in lines.items():
-            style = cycle[labels.index(label) % len(cycle)]
+            style = cycle[order.index(label) % len(cycle)]
             x = sorted(points)
             mean, std = (np.array([f(points[v]) for v in x]) for f in (np.mean, np.std))
             ax.plot(x, mean, marker=".", label=label, **style)
@@ -778,7 +779,6 @@ def command_report(args):
 
 
 # ------------------------------------------------------------------------------ command line
-
 
 def make_parser():
     """The command line: a sub-command for each table or figure."""
