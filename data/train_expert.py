@@ -320,12 +320,13 @@ class Training:
         return [(seed, "explorer", self.scheduled()["exploration_std"]) for seed in seeds]
 
     def tests(self):
-        """An evaluation's episodes and planners, with the training's budget."""
+        """An evaluation's episodes and planners, with the training's budget and horizon of now."""
         seeds = fac.episode_seeds(self.args.seed + 1, self.args.evaluate_episodes)
-        planners = {"expert": (self.learner.model, self.planning)}
+        planning = dataclasses.replace(self.planning, horizon=self.scheduled()["horizon"])
+        planners = {"expert": (self.learner.model, planning)}
         if self.student:
             planners["student"] = self.student.model, dataclasses.replace(
-                self.planning, horizon=self.student.config.horizon)
+                planning, horizon=min(planning.horizon, self.student.config.horizon))
         return [(seed, name) for name in planners for seed in seeds], planners
 
     def learn(self):
