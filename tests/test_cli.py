@@ -269,7 +269,7 @@ def refused(done, *parts, program="fac_tdmpc_ref.py"):
     (["--num-agents", "0"], ["agents", "[1, 3]", "0"]),
     (["--num-agents", "-3"], ["agents", "[1, 3]", "-3"]),
     (["--steps", "0"], ["steps", "at least 1", "0"]),
-    (["--batch-size", "0"], ["batch_size", "at least 1"]),
+    (["--batch-size", "1"], ["batch_size", "at least 2"]),
     (["--horizon", "-1"], ["horizon", "at least 0"]),
     (["--horizon", "500"], ["horizon", "at most 499"]),
     (["--noise-samples", "1"], ["noise_samples", "at least 2"]),
