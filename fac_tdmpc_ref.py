@@ -1169,10 +1169,9 @@ class Workers(contextlib.AbstractContextManager):
 
 
 def _run_worker(target, connection):
-    with contextlib.suppress(EOFError, OSError):  # the parent is gone or has closed the pipe
+    with contextlib.suppress(EOFError, OSError), one_thread():  # the parent is gone, or its pipe
         try:
-            with one_thread():
-                target(connection)
+            target(connection)
         except UserError as error:
             connection.send(error)
 
@@ -1535,11 +1534,11 @@ def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="eval
             "plan_ms_median": 1e3 * float(np.median(seconds.mean(1)))}
 
 
-def check_task(sizes, task):
-    """UserError if a model of these sizes isn't for the task."""
+def check_task(sizes, task, what="the model"):
+    """UserError if what has these sizes (a ModelConfig, a Replay) isn't for the task."""
     _, _, *dims = lookup_task(task)
     need(dims == [sizes.dim_obs, sizes.dim_action],
-         f"the model has (dim O, dim A) = ({sizes.dim_obs}, {sizes.dim_action}), {task} has "
+         f"{what} has (dim O, dim A) = ({sizes.dim_obs}, {sizes.dim_action}), {task} has "
          f"({dims[0]}, {dims[1]}); name the task it was made for")
 
 
@@ -1861,7 +1860,8 @@ def command_evaluate(args):
     need(task := args.task or header.get("task"), f"{args.model}: header: no task; pass --task")
     need(task == header.get("task") or not args.record, f"{args.model}: header: task: expected "
          f"{task!r} to record its returns, found {header.get('task')!r}")
-    read_records(args.model)  # which --record adds to: what is damaged is missed now
+    if args.record:
+        read_records(args.model)  # which it adds to: what is damaged is missed now
     found = evaluate(model, task, planning, args.episodes, args.seed, args.workers)
     returns, ms = found["returns"], found["plan_ms_median"]
     if args.record:

@@ -652,8 +652,8 @@ def report_curves(name, path, figures):
         for row in table:
             ratio, lags = follow_up(rows, row[0])
             result[row[0]].update(ratio=ratio, lag=lags)
-            lags = "; ".join(" / ".join(map(str, x)) for x in lags)
-            row[-1:] = ["-" if ratio is None else f"{ratio:.2f}", lags]
+            row[-1:] = ["-" if ratio is None else f"{ratio:.2f}",
+                        "; ".join(" / ".join(map(str, x)) for x in lags)]
     return result, markdown(heads, table)
 
 

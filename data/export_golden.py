@@ -207,8 +207,7 @@ def write_golden(folder):
     """golden.npz of the expert and the replay in a folder."""
     path, rng = folder / "expert.npz", np.random.default_rng(0)
     expert, header = fac.load_model(path)
-    config = fac.from_dict(ExpertConfig, header.get("training", {}),
-                           f"{path}: header: training")
+    config = fac.from_dict(ExpertConfig, header.get("training", {}), f"{path}: header: training")
     planner = fac.PlannerConfig(samples=64, elites=8, pi_trajs=0)
     distill = fac.DistillConfig(batch_size=8, noise_samples=10, **AS_PRINTED)
     sizes = fac.student_config(expert.config, expert.config.dim_action, distill.sizes, "latent")

@@ -251,9 +251,7 @@ def command_agreement(args):
     theirs, *_ = header.get("data") or [None]
     fac.need(theirs in (None, fac.checksum(expert.params.values())), f"{args.model}: was distilled "
              f"from another expert; name it with --expert")
-    fac.need((replay.dim_obs, replay.dim_action) == (student.config.dim_obs,
-                                                     student.config.dim_action),
-             f"{replay.path}: is of another robot; name the task's own with --replay")
+    fac.check_task(replay, task, f"{replay.path} (--replay)")
     plt, rng = fac.pyplot(), np.random.default_rng(args.seed)
     config = fac.PlannerConfig(**fac.made_for(header, args.model))
     _, held_out = replay.starts(1, header.get("distill", {}).get("held_out",

@@ -150,10 +150,10 @@ def benchmark_decisions(robot, workers, planning, rounds):
     return rows, 1e6 * float(np.median(hand_over)) if workers else None
 
 
-def wake(workers, count, message=None):
+def wake(workers, count):
     """Wake all workers and wait for their answers, without planning: what a plan pays."""
     for i in range(count):
-        workers.send(i, message)
+        workers.send(i, None)
     workers.receive_all()
 
 

@@ -598,7 +598,6 @@ def test_a_model_that_names_no_task_needs_one(tmp_path, distilled, capsys):
     assert "student.npz: header: no task; pass --task" in capsys.readouterr().err
 
 
-
 def test_evaluation_does_not_depend_on_the_number_of_workers(tmp_path, distilled):
     student = distilled[1] / "student.npz"
     found = [last_json(run("evaluate", "--model", student, "--episodes", "2", "--seed", "3",
