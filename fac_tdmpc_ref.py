@@ -136,7 +136,7 @@ class ModelConfig(Settings):
 class PlannerConfig(Settings):
     """MPPI. Raises UserError for values that can't plan."""
     samples: int = field(128, "S: action sequences drawn in an iteration [D10]", paper=512, least=1)
-    iterations: int = field(4, "refinements of the proposal in a decision [D10]", paper=6, least=1)
+    iterations: int = field(4, "refinements of the Gaussian in a decision [D10]", paper=6, least=1)
     elites: int = field(0, "best ones, which refine it; 0: samples / 8 (Table 2: 64)", least=0)
     pi_trajs: int = field(24, "policy proposals, where there is a policy (Table 2)", least=0)
     horizon: int = field(3, "H of Equation 2, unless the model's file names its own (Table 2)",
@@ -151,7 +151,7 @@ class PlannerConfig(Settings):
     returns: str = field("fast", "Equation 2 as it reads (plain: h_step_return), or the same, fast",
                          choices=("fast", "plain"))
     output: str = field("sampled", "the action: an elite drawn by score (TD-MPC's code) or the "
-                        "proposal's mean", paper="mean", choices=("sampled", "mean"))
+                        "Gaussian's mean", paper="mean", choices=("sampled", "mean"))
 
     def __post_init__(self):
         super().__post_init__()
@@ -519,7 +519,8 @@ def unroll(model, z, actions, transitions, tapes=None):
 
     z (N, m, B), actions (L, A, B, K): K perturbed copies of a trajectory. Returns the networks'
     input x (N, m + d, L * B * K), columns in the order (L, B, K), with s_{h+1} = f_T(s_h, a_h),
-    and the last latents (N, m, B * K) of L transitions (Equation 1's; Equation 4 has L - 1)."""
+    and the latents (N, m, B * K) after the last of `transitions`: L - 1 for Equation 4, L for
+    Equation 1. tapes: for `predict_backward`, a list for each network and transition."""
     L, _, B, K = actions.shape
     n, m, d = model.config.num_agents, model.config.latent_dim, model.config.agent_actions
     columns = B * K
@@ -621,13 +622,13 @@ def distill_loss(student, features, actions, targets, config, grads=None, diverg
     return loss, means[0], (means[1] + means[2]) / 2
 
 
-def new_student(expert, sizes, config, seed):
+def new_student(expert, sizes, seed):
     """Adam on the trained weights of a fresh student of an expert, and that student.
 
     Where the student reads the expert's latent, it shares the expert's own encoder arrays [D3]."""
     student = WorldModel.create(sizes, stream(seed, "student"))
     frozen = {"_expert" + k: v for k, v in expert.params.items()
-              if k.startswith("_encoder.") and config.encoder_input == "latent"}
+              if k.startswith("_encoder.") and sizes.expert_latent_dim}
     optimizer = Adam({k: v for k, v in student.params.items() if not k.startswith("_expert")})
     return optimizer, WorldModel(sizes, {**optimizer.params, **frozen})
 
@@ -643,12 +644,10 @@ def learning_rate(config, t):
 def perturbed_batch(expert, student, obs, actions, config, rng):
     """Features (1, F, B), perturbed actions (L, A, B, K) and the expert's predictions for them.
 
-    obs (O, B) and actions (L, A, B) come from the replay; a_h + eps_h is clipped [D8]."""
+    obs (O, B) and actions (L, A, B) are what `draw` found; a_h + eps_h is clipped [D8]."""
     noise = rng.standard_normal((*actions.shape, config.noise_samples), F32)
-    noise *= F32(config.noise_std)
-    perturbed = np.add(noise, actions[..., None], out=noise)
-    if config.clip_actions:
-        np.clip(perturbed, -1, 1, out=perturbed)
+    limit = 1 if config.clip_actions else np.inf
+    perturbed = np.clip(actions[..., None] + F32(config.noise_std) * noise, -limit, limit)
     z = expert.encode(obs)
     features = z.reshape(1, -1, z.shape[-1]) if student.config.expert_latent_dim else obs[None]
     return features, perturbed, predict(expert, z, perturbed)
@@ -680,7 +679,7 @@ class Distiller:
         agents = theirs.dim_action if num_agents is None else num_agents
         with one_thread():
             self.optimizer, self.student = new_student(expert, sizes or student_config(
-                theirs, agents, config.sizes, config.encoder_input), config, seed)
+                theirs, agents, config.sizes, config.encoder_input), seed)
         needed = config.steps * config.batch_size // config.reuse
         self.pool_size = max(config.batch_size, min(POOL, needed))
         self._number = self._pool = None
@@ -689,7 +688,7 @@ class Distiller:
                         for _ in range(2)]
 
     def draw(self, number, part, size):
-        """Line 4 and the expert's part of line 5 for a part of a pool, as `perturbed_batch`."""
+        """Line 4 and the expert's part of line 6 for a part of a pool, as `perturbed_batch`."""
         rng = stream(self.seed, f"pool {number}", part)
         obs, actions = self.replay.sequences(rng.choice(self.train_starts, size),
                                              self.config.horizon + 1)
@@ -743,8 +742,8 @@ class Distiller:
     def run(self, play=None):
         """Algorithm 1 from here to its end; yields the losses of each step.
 
-        play(first, count): the states, as `add` takes them, of episodes that the student plays, of
-        which it has played `first` before; not needed without own episodes [D9]."""
+        play(first, count): lets the student play episodes first, ..., first + count - 1 of its
+        own and returns their states (see `add`); not needed without own episodes [D9]."""
         need(play or not self.config.own_episodes, "pass `play`, or configure own_episodes=0")
         while self.t < self.config.steps:
             quarter, played = 4 * self.t // self.config.steps, len(self.own) // EPISODE_STEPS
@@ -831,9 +830,9 @@ def h_step_return(model, z, actions, config):
 def mppi(returns, mean, config, rngs, proposals=None):
     """MPPI: refine a Gaussian over action sequences by its elites, for each agent alone.
 
-    returns: (N, L, d, S) actions -> (N, S); mean (N, L, d): the proposal to start from; rngs:
-    one Generator for each agent; proposals (N, L, d, P): sequences that compete in every
-    iteration. Elites are chosen agent by agent: G is a sum of G_i(a_i), so the best of each is
+    returns: (N, L, d, S) actions -> (N, S); mean (N, L, d): the first Gaussian's; rngs: one
+    Generator for each agent; proposals (N, L, d, P): sequences that compete in every iteration.
+    Elites are chosen agent by agent (Equation 3): G is a sum of G_i(a_i), so the best of each is
     the best of all (Proposition 1). N = 1 is centralized MPPI. Returns the new mean (N, L, d), the
     last elites (N, L, d, E) and their scores (N, E), which sum to 1."""
     mean, std = mean[..., None], F32(config.max_std)
@@ -922,7 +921,7 @@ class Planner(contextlib.AbstractContextManager):
     workers: processes beside this one; each plans for a part of the agents (0: all here).
     Every agent owns its random stream and one BLAS thread computes each product, so the plan
     is the same, bit for bit, for every number of workers. Raises WorkerError when a worker
-    has died."""
+    has died. Weights are copied: make a new one when they have changed."""
 
     def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
         self.model, self._parts = model, split_agents(model.config.num_agents, workers)
@@ -990,15 +989,15 @@ class Returns:
     all samples start from one latent. LayerNorm's mean and gain are folded into the weights."""
 
     def __init__(self, model):
-        self.sizes, p = model.config, model.params
+        self.sizes, p = model.config, model.params  # below, w is the hidden width
         step, both_q = ("_dynamics", "_reward"), ("_Q1", "_Q2")
-        self.first = [side_by_side(p, step, 0), self._fold_norm(p)]     # (N, 2h + 2, m + d + 1)
-        self.second = [[homogeneous(p, f"{name}.{i}") for name in pair]  # (N, h + 1, h + 1)
+        self.first = [side_by_side(p, step, 0), self._fold_norm(p)]     # (N, 2w + 2, m + d + 1)
+        self.second = [[homogeneous(p, f"{name}.{i}") for name in pair]  # (N, w + 1, w + 1)
                        for pair, i in ((step, 2), (both_q, 3))]
         self.to_latent, self.to_reward, *to_q = (
             homogeneous(p, f"{name}.{i}")[:, :-1].copy()
             for name, i in (*((name, 4) for name in step), *((name, 5) for name in both_q)))
-        self.to_q = np.concatenate(to_q, 2) / 2                         # (N, 1, 2h + 2)
+        self.to_q = np.concatenate(to_q, 2) / 2                         # (N, 1, 2w + 2)
         # samples in a block: OpenBLAS is fastest on small matrices when the block fits the cache
         self.block = 256 if model.config.mlp_dim >= 256 else 128
 
@@ -1025,7 +1024,7 @@ class Returns:
         """Plan from the latent z (N, m, 1): at h = 0 the first products read (a, 1) only."""
         self.horizon, self.discount = config.horizon, config.discount
         m = self.sizes.latent_dim
-        self.first_at_start = [W[:, :, m:].copy() for W in self.first]  # (N, 2h + 2, d + 1)
+        self.first_at_start = [W[:, :, m:].copy() for W in self.first]  # (N, 2w + 2, d + 1)
         for W, at_start in zip(self.first, self.first_at_start):
             at_start[..., -1:] += W[:, :, :m] @ z
         return self
@@ -1091,7 +1090,7 @@ def useful_workers(agents):
 
 
 def _planning_worker(connection):
-    """Plans for its part of the agents: latents in, actions out; a list is new random streams."""
+    """Plans for its part of the agents: latents in, actions out; a list is `reset`'s seeds."""
     planner = AgentPlanner(*connection.recv())
     while True:
         message = connection.recv()
@@ -1130,7 +1129,7 @@ class Workers(contextlib.AbstractContextManager):
         """Send to worker i."""
         if self._members[i][1].closed:
             raise WorkerError(f"{self._name} {i} was stopped before; start anew")
-        try:  # plain pickle: the connection's own takes half of a hand-over
+        try:  # plain pickle: Connection.send's own takes half of a hand-over's time
             self._members[i][1].send_bytes(pickle.dumps(message))
         except (BrokenPipeError, ConnectionResetError):
             while True:  # past answers left unread, to what it ended with
@@ -1169,7 +1168,7 @@ class Workers(contextlib.AbstractContextManager):
 
 
 def _run_worker(target, connection):
-    with contextlib.suppress(EOFError, OSError), one_thread():  # the parent is gone, or its pipe
+    with contextlib.suppress(EOFError, ConnectionError), one_thread():  # the parent is gone
         try:
             target(connection)
         except UserError as error:
@@ -1301,7 +1300,7 @@ def draw_targets(obs, rng):
 
 def renew_targets(task, obs, share, rng):
     """Draw the targets of a share of reacher's states (8, B) anew, in place [D7]."""
-    if str(task).startswith("reacher"):
+    if TASKS.get(str(task), " ")[0] == "reacher":
         chosen = rng.random(obs.shape[1]) < share
         obs[3:5, chosen] = draw_targets(obs[:, chosen], rng)
 
@@ -1374,7 +1373,7 @@ def save_model(path, model, header):
 def load_model(path):
     """(model, header) of an expert or student. UserError names file, key, expected and found."""
     header, arrays = read_npz(path, ("expert", "student"))
-    config = from_dict(ModelConfig, header.get("model", {}), f"{path}: header: model")
+    config = from_dict(ModelConfig, header.get("model"), f"{path}: header: model")
     params = {}
     for name, i, kind, shape, _ in layers(config, policy="_pi.0.weight" in arrays):
         for part, expected in (("weight", shape), ("bias", (*shape[:2], 1))):
@@ -1422,7 +1421,8 @@ class Replay:
                  and len(value) == len(arrays["observation"]),
                  f"{path}: {key}: expected {dtype.__name__} of rank {rank} with a row for each "
                  f"transition, found {f'{value.dtype} {value.shape}' if value.size else 'nothing'}")
-            need(np.isfinite(value).all(), f"{path}: {key}: holds values that are not finite")
+            need((np.abs(value) <= (1 if key == "action" else 65504)).all(), f"{path}: {key}: "
+                 "holds values that are not finite, or actions outside [-1, 1]")
         self.observation, self.action = arrays["observation"], arrays["action"]
         self.ends = np.flatnonzero(~arrays["continues"])
         self.dim_obs, self.dim_action = self.observation.shape[1], self.action.shape[1]
@@ -1509,7 +1509,7 @@ def play(model, task, config, seeds, workers=None, label="playing"):
             Workers(_playing_worker, workers, "evaluation worker") as pool:
         for w in range(workers):
             pool.send(w, (model, task, config, [seeds[i] for i in parts[w]]))
-        while bar.n < bar.total:
+        while sum(done) < E * T:  # a disabled bar doesn't count
             for w, part in enumerate(parts):
                 if done[w] < len(part) * T:
                     played = pool.receive(w) if workers else list(itertools.islice(here, 25))
@@ -1518,14 +1518,14 @@ def play(model, task, config, seeds, workers=None, label="playing"):
                         array[i, t:t + len(played)] = values
                     done[w] += len(played)
             bar.update(sum(done) - bar.n)
-            bar.set_postfix_str(f"mean return so far about {found[2].sum() * T / bar.n:.0f}", False)
+            bar.set_postfix_str(f"mean return about {found[2].sum() * T / sum(done):.0f}", False)
     return found
 
 
 def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="evaluating"):
     """Returns of `episodes` episodes, played side by side in `workers` processes (see `play`).
 
-    Gives {"returns", "plan_ms_median" (of the episodes' mean decisions)}. Raises UserError if the
+    Gives {"returns", "plan_ms_median" (over episodes, of a mean decision)}. Raises UserError if the
     model isn't for the task."""
     check_task(model.config, task)
     seeds = episode_seeds(seed, episodes)
@@ -1812,9 +1812,10 @@ def time_both(expert, student, planning, obs):
         seconds = interleaved_seconds([functools.partial(p.act, obs) for p in planners], 20,
                                       "timing")
     central, alone, parallel = (1e3 * np.median(seconds, 0)).tolist()
-    return {"plan_ms_expert": central, "plan_ms_expert_own": central,
+    parallel = parallel if beside else alone  # which were timed twice
+    return {"plan_ms_expert": central, "plan_ms_student_in_process": alone,
             "plan_ms_student": min(alone, parallel), "speedup": central / min(alone, parallel),
-            "plan_ms_student_in_process": alone, "plan_workers": beside if parallel < alone else 0}
+            "plan_workers": beside if parallel < alone else 0}
 
 
 def report(result, planning, eval_seed):

@@ -346,7 +346,7 @@ def fresh_student(run):
     expert, header = fac.load_model(fac.data_file(run["task"], "expert.npz"))
     config, agents = fac.DistillConfig(), json.loads(run["settings"])["num_agents"]
     sizes = fac.student_config(expert.config, agents, config.sizes, config.encoder_input)
-    return fac.new_student(expert, sizes, config, int(run["seed"]))[1], header
+    return fac.new_student(expert, sizes, int(run["seed"]))[1], header
 
 
 def command_departures(args):

@@ -218,7 +218,7 @@ class OnlineStudent:
     def __init__(self, expert, num_agents, config, seed):
         self.config, self.seed = config, seed
         sizes = fac.student_config(expert.config, num_agents, config.sizes, config.encoder_input)
-        self.optimizer, self.model = fac.new_student(expert, sizes, config, seed)
+        self.optimizer, self.model = fac.new_student(expert, sizes, seed)
 
     def update(self, expert, obs, actions):
         """One step of Algorithm 1 on observations (O, B) and actions (H, A, B); its divergences."""

@@ -373,6 +373,13 @@ def test_replay_that_is_not_finite(tmp_path, key, bad):
     refusal(lambda: fac.Replay(path), path, f"{key}:", "not finite")
 
 
+def test_replay_whose_actions_are_out_of_range(tmp_path):
+    value = replay_arrays()["action"]
+    value[100, 1] = -1.01
+    path = write_replay(tmp_path / "r.npz", action=value)
+    refusal(lambda: fac.Replay(path), path, "action:", "outside [-1, 1]")
+
+
 @pytest.mark.parametrize("continues", [np.ones(180, bool), np.arange(180) % 30 != 0])
 def test_replay_must_end_with_an_episode(tmp_path, continues):
     path = write_replay(tmp_path / "r.npz", continues=continues)

@@ -277,6 +277,17 @@ def test_odd_settings_learn_all_the_same(replay, odd, n):
     assert np.isfinite(fac.rank_correlation(distiller, 8)).all()
 
 
+@pytest.mark.parametrize("encoder_input", ["latent", "observation"])
+def test_sizes_of_one_s_own_say_what_the_encoder_reads(tmp_path, replay, encoder_input):
+    expert = random_model(n=1)
+    sizes = fac.student_config(expert.config, 3, "table2", encoder_input)
+    with contextlib.closing(fac.Distiller(expert, replay, CONFIG, sizes=sizes)) as distiller:
+        distiller.step()
+        fac.save_model(tmp_path / "student.npz", distiller.student, {"kind": "student"})
+    student, _ = fac.load_model(tmp_path / "student.npz")
+    assert student.encode(np.zeros((8, 2), np.float32)).shape == (3, sizes.latent_dim, 2)
+
+
 def test_an_expert_without_a_policy_says_so(replay):
     expert = random_model(n=1)
     with pytest.raises(fac.UserError, match="no policy.*--own-episodes 0"):

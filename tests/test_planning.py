@@ -330,6 +330,17 @@ def test_a_worker_that_ends_while_it_is_sent_to_says_why():
             workers.send(0, bytes(10_000_000))  # more than a pipe holds
 
 
+def misses_a_file(connection):
+    open("/nonexistent/file")
+
+
+def test_a_worker_s_own_error_is_seen(capfd):
+    with fac.Workers(misses_a_file, 1) as workers:
+        with pytest.raises(fac.WorkerError, match="exit code 1"):
+            workers.receive(0)
+    assert "FileNotFoundError: [Errno 2]" in capfd.readouterr().err
+
+
 def test_a_gain_of_zero_is_a_gain_all_the_same():
     model, rng = random_model(), np.random.default_rng(3)
     model.params["_Q1.1.weight"][:, :4] = 0
