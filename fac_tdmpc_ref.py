@@ -644,10 +644,10 @@ def learning_rate(config, t):
 def perturbed_batch(expert, student, obs, actions, config, rng):
     """Features (1, F, B), perturbed actions (L, A, B, K) and the expert's predictions for them.
 
-    obs (O, B) and actions (L, A, B) are what `draw` found; a_h + eps_h is clipped [D8]."""
-    noise = rng.standard_normal((*actions.shape, config.noise_samples), F32)
+    obs (O, B); actions a_h (L, A, B, K), or (L, A, B, 1): a_h + eps_h may be clipped [D8]."""
+    noise = rng.standard_normal((*actions.shape[:3], config.noise_samples), F32)
     limit = 1 if config.clip_actions else np.inf
-    perturbed = np.clip(actions[..., None] + F32(config.noise_std) * noise, -limit, limit)
+    perturbed = np.clip(actions + F32(config.noise_std) * noise, -limit, limit)
     z = expert.encode(obs)
     features = z.reshape(1, -1, z.shape[-1]) if student.config.expert_latent_dim else obs[None]
     return features, perturbed, predict(expert, z, perturbed)
@@ -675,7 +675,8 @@ class Distiller:
         self.expert, self.config, self.seed = expert, config, seed
         need(expert.has_policy or not config.own_episodes, "the expert has no policy, which says "
              "what to do in the student's own states; pass --own-episodes 0")
-        self.replay, self.own = replay, np.zeros((0, replay.dim_obs), np.float16)  # states [D9]
+        self.replay = replay
+        self.own = np.zeros((0, EPISODE_STEPS, replay.dim_obs + replay.dim_action), np.float16)
         agents = theirs.dim_action if num_agents is None else num_agents
         with one_thread():
             self.optimizer, self.student = new_student(expert, sizes or student_config(
@@ -689,17 +690,22 @@ class Distiller:
 
     def draw(self, number, part, size):
         """Line 4 and the expert's part of line 6 for a part of a pool, as `perturbed_batch`."""
-        rng = stream(self.seed, f"pool {number}", part)
-        obs, actions = self.replay.sequences(rng.choice(self.train_starts, size),
-                                             self.config.horizon + 1)
-        is_own = np.zeros(size, bool)
-        if len(self.own):  # [D9]
-            is_own = rng.random(size) < self.config.own_share
-            obs[:, is_own] = self.own[rng.integers(len(self.own), size=is_own.sum())].T
+        rng, L = stream(self.seed, f"pool {number}", part), self.config.horizon + 1
+        K, dim_obs = self.config.noise_samples, self.replay.dim_obs
+        obs, actions = self.replay.sequences(rng.choice(self.train_starts, size), L)
+        actions = np.repeat(actions[..., None], K, -1)
+        is_own = rng.random(size) < (self.config.own_share if len(self.own) else 0)  # [D9]
+        if count := is_own.sum():
+            episode = rng.integers(len(self.own), size=count)
+            t = rng.integers(EPISODE_STEPS - L + 1, size=count) + np.arange(L)[:, None]
+            played = self.own[episode, t].swapaxes(1, 2).astype(F32)  # (L, O + A, count)
+            obs[:, is_own] = played[0, :dim_obs]
         renew_targets(self.replay.header.get("task"), obs, self.config.new_targets, rng)
-        if is_own.any():
-            actions[..., is_own] = policy_rollout(
-                self.expert, self.expert.encode(obs[:, is_own]), [F32(0)] * len(actions))[:, 0]
+        if count:  # copies of what the student did and, as many, of what the policy would do
+            theirs = policy_rollout(self.expert, self.expert.encode(obs[:, is_own]),
+                                    [F32(0)] * L)[:, 0]
+            actions[:, :, is_own] = np.where(rng.random((count, K)) < 0.5, theirs[..., None],
+                                             played[:, dim_obs:, :, None])
         return perturbed_batch(self.expert, self.student, obs, actions, self.config, rng)
 
     def batch(self, t):
@@ -743,12 +749,12 @@ class Distiller:
         """Algorithm 1 from here to its end; yields the losses of each step.
 
         play(first, count): lets the student play episodes first, ..., first + count - 1 of its
-        own and returns their states (see `add`); not needed without own episodes [D9]."""
+        own and returns what `add` takes; not needed without own episodes [D9]."""
         need(play or not self.config.own_episodes, "pass `play`, or configure own_episodes=0")
         while self.t < self.config.steps:
-            quarter, played = 4 * self.t // self.config.steps, len(self.own) // EPISODE_STEPS
+            played, quarter = len(self.own), 4 * self.t // self.config.steps
             if quarter * self.config.own_episodes > played:
-                self.add(play(played, quarter * self.config.own_episodes - played))
+                self.add(*play(played, quarter * self.config.own_episodes - played))
             yield self.step()
 
     @property
@@ -756,10 +762,10 @@ class Distiller:
         """Steps made so far."""
         return self.optimizer.t
 
-    def add(self, observation):
-        """Let the states (E, EPISODE_STEPS, O) of the student's episodes join the data [D9]."""
-        self.own = np.concatenate([self.own, observation.reshape(-1, self.own.shape[1])
-                                   .astype(np.float16)])
+    def add(self, observation, action):
+        """Let the student's episodes (E, T, O), (E, T, A) join the data [D9]; T: EPISODE_STEPS."""
+        episodes = np.concatenate([observation, action], 2).astype(np.float16)
+        self.own = np.concatenate([self.own, episodes])
         self._number = None  # its pool is drawn again, with them
 
     def state(self):
@@ -769,7 +775,7 @@ class Distiller:
     def load(self, state):
         """Go on from a `state`."""
         self.optimizer.load(state)
-        self.own, self._number = state["own"], None
+        self.own, self._number = state["own"].reshape(-1, *self.own.shape[1:]), None
 
     def close(self):
         """Stop the threads."""
@@ -802,7 +808,8 @@ def rank_correlation(distiller, states, discount=0.99):
     student, config = distiller.student, dataclasses.replace(distiller.config, noise_samples=32)
     obs, actions = distiller.replay.sequences(starts, config.horizon + 1)
     with one_thread():
-        x, actions, expert = perturbed_batch(distiller.expert, student, obs, actions, config, rng)
+        x, actions, expert = perturbed_batch(distiller.expert, student, obs, actions[..., None],
+                                             config, rng)
         own = predict(student, student.encode_features(x), actions)
     return (spearman(expert[1] + expert[2], own[1] + own[2]).mean(-1),
             spearman(*(horizon_returns(*out, discount) for out in (expert, own))).mean(-1))
@@ -1578,7 +1585,7 @@ def train_student(distiller, out, settings, playing, workers):
     def play_own(first, count):
         seeds = training_seeds(distiller.seed, "own episode", first, count)
         return play(distiller.student, settings["task"], playing, seeds, workers,
-                    "the student plays")[0]
+                    "the student plays")[:2]
 
     checkpoint, config, curve, before = out / "checkpoint.npz", distiller.config, [], 0.0
     if checkpoint.exists():
@@ -1871,8 +1878,8 @@ def command_evaluate(args):
     print_table([("task", "episodes", "return", "min", "max", "ms a decision"),
                  (task, str(args.episodes), f"{mean:.0f} ± {std:.0f}", f"{min(returns):.0f}",
                   f"{max(returns):.0f}", f"{ms:.1f}")])
-    return {"return_mean": mean, "return_std": std, "returns": returns, "plan_ms_median": ms,
-            "episodes": args.episodes, "task": task, "seed": args.seed}
+    return {"return_mean": mean, "return_std": std, **found, "episodes": args.episodes,
+            "task": task, "seed": args.seed}
 
 
 def add_config(parser, config_class, title=None, prefix="", skip=(), **defaults):

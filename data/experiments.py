@@ -168,9 +168,9 @@ def planning_for(header, about):
 
 
 def episodes(model, task, planning, seeds, environment=None):
-    """Observations (E, T, O) and returns (E,) of a model's episodes, in this process."""
-    obs, _, rewards, _ = zip(*fac.decisions(model, task, planning, seeds, environment))
-    return (np.reshape(obs, (len(seeds), fac.EPISODE_STEPS, -1)),
+    """Observations (E, T, O), actions (E, T, A) and returns (E,) of a model, in this process."""
+    obs, actions, rewards, _ = zip(*fac.decisions(model, task, planning, seeds, environment))
+    return (*(np.reshape(x, (len(seeds), fac.EPISODE_STEPS, -1)) for x in (obs, actions)),
             np.reshape(rewards, (len(seeds), -1)).sum(1))
 
 
@@ -275,7 +275,7 @@ def distil(task, seed, case, settings):
 
     def play_own(first, count):
         seeds = fac.training_seeds(seed, "own episode", first, count)
-        return episodes(student, task, playing, seeds, environment)[0]
+        return episodes(student, task, playing, seeds, environment)[:2]
 
     every = -(-config.steps // own["evaluations"])
     with contextlib.closing(distiller):
@@ -284,7 +284,7 @@ def distil(task, seed, case, settings):
             if distiller.t % every and distiller.t < config.steps:
                 continue
             seeds = fac.episode_seeds(0, own["episodes"])
-            row = summary(episodes(student, task, planning, seeds, environment)[1])
+            row = summary(episodes(student, task, planning, seeds, environment)[2])
             if not tap:  # whose actions are others
                 q, g = fac.rank_correlation(distiller, 256, planning.discount)
                 row.update(rank_q=float(q[0]), rank_return=float(g[-1]))
@@ -418,7 +418,7 @@ def plan_with(task, seed, case, settings, students):
     environment = (DisturbedEnvironment(task, settings["joint"], settings["kind"])
                    if settings.get("kind") else None)
     seeds = fac.episode_seeds(0, settings["episodes"])
-    yield summary(episodes(model, task, planning, seeds, environment)[1])
+    yield summary(episodes(model, task, planning, seeds, environment)[2])
 
 
 class DisturbedEnvironment(fac.Environment):

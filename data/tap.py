@@ -53,13 +53,11 @@ class ActionVAE:
         return float((error ** 2).sum() + beta * kl.sum()) / batch
 
     def fit(self, draw, rng, steps, batch=256, lr=1e-3, beta=0.01):
-        """Learn from draw(batch) -> columns x; returns the last tenth's mean loss."""
-        losses = []
+        """Learn from draw(batch) -> columns x."""
         for _ in range(steps):
             noise = rng.standard_normal((LATENT_ACTION, batch), np.float32)
-            losses.append(self.loss(draw(batch), noise, beta, self.optimizer.grads))
+            self.loss(draw(batch), noise, beta, self.optimizer.grads)
             self.optimizer.step(lr, clip=10.0)
-        return float(np.mean(losses[-max(1, steps // 10):]))
 
     def encode(self, x):
         """Columns x to latent actions (2, B) in [-1, 1]: the means of q."""
@@ -67,9 +65,9 @@ class ActionVAE:
         return np.clip(mu / REACH, -1, 1)
 
     def decode(self, s, u):
-        """A latent (m, 1) and a latent action (2,) in [-1, 1] to the robot's action (A,)."""
-        su = np.concatenate([s, REACH * u[:, None]])[None]
-        return np.clip(fac.forward(fac.MLP, self.params, "decode", su)[0, :, 0], -1, 1)
+        """Latents (m, B) and latent actions (2, B) in [-1, 1] to the robot's actions (A, B)."""
+        su = np.concatenate([s, REACH * u])[None]
+        return np.clip(fac.forward(fac.MLP, self.params, "decode", su)[0], -1, 1)
 
 
 class TapDistiller(fac.Distiller):
@@ -97,6 +95,12 @@ class TapDistiller(fac.Distiller):
         u = self.vae.encode(x[0]).reshape(LATENT_ACTION, steps, *columns)
         return features, np.ascontiguousarray(u.swapaxes(0, 1)), targets
 
+    def add(self, observation, action):
+        """As Distiller's, of latent actions (E, T, 2): `draw` needs the robot's."""
+        s = self.expert.encode(observation.reshape(-1, observation.shape[2]).T)[0]
+        action = self.vae.decode(s, action.reshape(-1, LATENT_ACTION).T).T
+        super().add(observation, action.reshape(*observation.shape[:2], -1))
+
 
 class DecodingEnvironment(fac.Environment):
     """A task for TAP's planner: its actions are latent ones."""
@@ -111,5 +115,5 @@ class DecodingEnvironment(fac.Environment):
 
     def step(self, action):
         s = self._expert.encode(self._obs[:, None])[0]
-        self._obs, reward = super().step(self._vae.decode(s, action))
+        self._obs, reward = super().step(self._vae.decode(s, action[:, None])[:, 0])
         return self._obs, reward

@@ -222,8 +222,8 @@ class OnlineStudent:
 
     def update(self, expert, obs, actions):
         """One step of Algorithm 1 on observations (O, B) and actions (H, A, B); its divergences."""
-        config, t = self.config, self.optimizer.t
-        batch = fac.perturbed_batch(expert, self.model, obs, actions[:config.horizon + 1], config,
+        config, t, L = self.config, self.optimizer.t, self.config.horizon + 1
+        batch = fac.perturbed_batch(expert, self.model, obs, actions[:L, ..., None], config,
                                     fac.stream(self.seed, "perturbations", t))
         _, *divergences = fac.distill_loss(self.model, *batch, config, self.optimizer.grads)
         self.optimizer.step(fac.learning_rate(config, t), config.grad_clip)
