@@ -7,8 +7,8 @@
 
 Figures 4, 5, 7, 8, 12, 13, departures and `sweep` are lists of runs, each a task, a seed, a case
 and settings. Rows go to one CSV under data/results as runs end; the same command again makes those
-that are missing. `report` draws figures and tables from the CSVs alone. Table 3 is in speed.py, TAP
-in tap.py, section 5.6 in look.py. Clients of fac_tdmpc_ref.py, which knows nothing of this.
+that are missing. `report` draws them, from the CSVs and the experts' records. Table 3 is in
+speed.py, TAP in tap.py, section 5.6 in look.py: clients, of which fac_tdmpc_ref.py knows nothing.
 """
 import contextlib
 import csv
@@ -56,15 +56,17 @@ def read_rows(path):
     columns = ",".join(ROW)  # of which a kill may have left a part
     fac.need(head == columns or "\n" not in text and columns.startswith(head),
              f"{path}: expected the columns {columns}, found {head[:200]}; choose another --out")
-    lines = [next(csv.reader([line]), []) for line in lines]  # a cut one alone
-    rows = [dict(zip(ROW, line)) for line in lines if len(line) == len(ROW)]
-    for row in rows:
+    rows = []
+    for line in lines:
         try:
-            numbers = [float(row[key] or 0) for key in ROW[4:-1]]
-            fac.need(np.isfinite(numbers).all() and json.loads(row["settings"]).items, "")
-        except (ValueError, AttributeError, fac.UserError):
+            row = dict(zip(ROW, cells := next(csv.reader([line]), [])))
+            if len(cells) == len(ROW):  # a kill cuts one line alone
+                numbers = [float(row[key] or 0) for key in ROW[4:-1]]
+                fac.need(np.isfinite(numbers).all() and json.loads(row["settings"]).items, "")
+                rows.append(row)
+        except (ValueError, AttributeError, RecursionError, csv.Error, fac.UserError):
             raise fac.UserError(f"{path}: expected numbers from {ROW[4]} on and settings as JSON, "
-                                f"found {','.join(row.values())[:200]}; delete the line") from None
+                                f"found {line[:200]}; delete the line") from None
     return rows
 
 
@@ -530,14 +532,15 @@ CASES = [*METHODS, *(case for panel in FIGURE5.values() for case in panel)]
 
 
 def settled(path, but=()):
-    """A CSV's finished runs; UserError if those of one task, seed and case were made with other
-    settings than `but`: they don't belong in one figure."""
+    """A CSV's finished runs; UserError if those of one task and case were made with other settings
+    than `but`, or of one seed with other students: they don't belong in one figure."""
     rows, seen = finished(read_rows(path)), {}
     for task, seed, case, settings in rows:
         about = {k: v for k, v in json.loads(settings).items() if k not in but}
-        other = seen.setdefault((task, seed, case), about)
-        fac.need(other == about, f"{path}: {case} of {task}, seed {seed}, was made with {other} "
-                 f"and with {about}; delete the rows that are of no use")
+        for which, found in ((seed, about.pop("weights", None)), (None, about)):
+            other = seen.setdefault((task, which, case), found)
+            fac.need(other == found, f"{path}: {case} of {task} was made with {other} and, seed "
+                     f"{seed}, with {found}; delete the rows that are of no use")
     return rows
 
 
@@ -586,7 +589,7 @@ def draw_lines(path, panels, xlabel, **axes):
             ax.axhline(level, color="black", linewidth=0.8, linestyle=(0, (1, 3)), label="expert")
         ax.set(title=title, xlabel=xlabel, ylabel="episode return", ylim=(0, None), **axes)
         if axes:  # logarithmic: a tick for each point
-            ax.set_xticks(x, [f"{v:.0f}" for v in x])
+            ax.set_xticks(x := sorted(set().union(*lines.values())), [f"{v:.0f}" for v in x])
             ax.minorticks_off()
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, fontsize=8)
     fac.save_figure(path, figure)
@@ -689,11 +692,11 @@ def report_figure7(_, path, figures):
         least = {}
         for case, budgets in cases.items():
             full = np.mean(budgets.get((512, 6), {"return": [np.nan]})["return"])
-            good = {budget: about for budget, about in budgets.items() if about["ms"]
-                    and np.mean(about["return"]) >= KEEPS * full}
+            good = {budget: about for budget, about in budgets.items()
+                    if np.mean(about["return"]) >= KEEPS * full}
             for key in ("ms", "ms_workers") if case == "student" else ("ms",):
-                best = min(good, key=lambda b: np.mean(good[b][key]), default=None)  # noqa: B023
-                if best:
+                if good and all(about[key] for about in good.values()):  # all are timed
+                    best = min(good, key=lambda b: np.mean(good[b][key]))  # noqa: B023
                     least[case, key] = {"samples": best[0], "iterations": best[1],
                                         "ms": float(np.mean(good[best][key]))}
         if len(least) == 3:
@@ -785,17 +788,17 @@ def make_parser():
     parser = fac.Parser(prog="experiments.py", description="The paper's tables and figures, each "
                         "by one command.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="EXPERIMENT")
-    positive, several = (functools.partial(fac.natural, least=n) for n in (1, 2))
+    positive, several, ten = (functools.partial(fac.natural, least=n) for n in (1, 2, 10))
     sub = fac.add_command(
         commands, "table3", command_table3, "Planning speed: Table 3 (the networks) and whole "
         "decisions, centralized and factored, by threads and processes.",
         epilog="Fresh weights: speed doesn't depend on what a model has learned. Keep the machine "
         "quiet, and read ratios.")
-    sub.add_argument("--robots", nargs="+", default=list(ROBOTS), metavar="ROBOT",
+    sub.add_argument("--robots", nargs="+", default=list(ROBOTS), choices=ROBOTS, metavar="ROBOT",
                      help="some of: " + ", ".join(ROBOTS) + " [all]")
     sub.add_argument("--workers", type=fac.natural, help="processes beside this one, at most one "
                      "for each further agent [as many as there are cores for]")
-    sub.add_argument("--runs", type=int, default=100, help="of each network; decisions are timed a "
+    sub.add_argument("--runs", type=ten, default=100, help="of each network; decisions are timed a "
                      "tenth as often [100]")
     sub.add_argument("--figure", help="draw Figure 6 into this file")
     fac.add_config(sub, fac.PlannerConfig, **fac.paper_preset(fac.PlannerConfig))
@@ -807,7 +810,7 @@ def make_parser():
         sub.add_argument("--seeds", nargs="+", type=fac.natural, default=[0, 1, 2],
                          metavar="SEED", help="[0 1 2]")
         sub.add_argument("--jobs", type=positive, default=fac.cores(),
-                         help="runs at a time [one for each core]")
+                         help="runs at a time, of --backend loky [one for each core]")
         sub.add_argument("--out", help=f"the CSV [data/results/{name}.csv]")
         sub.add_argument("--episodes", type=positive, default=defaults.get("episodes", 10),
                          help="evaluation episodes of a run [%(default)s]")

@@ -419,6 +419,8 @@ def run(args):
     for source, name in ((args.file, "expert.npz"), (args.replay, "replay.npz")):
         need(not source or Path(source).resolve() != (out / name).resolve(),
              f"{source}: would be replaced by what is made of it; choose another --out")
+    need(arrays or environment or not (out / "replay.npz").exists(), f"{out / 'replay.npz'}: "
+         "another expert's; choose another --out, or pass --replay or --collect")
     if environment and not arrays:
         with tempfile.TemporaryDirectory() as scratch:  # an expert is replaced with its replay
             fac.write_npz(path := Path(scratch) / "expert.npz", header, weights)

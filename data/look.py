@@ -122,6 +122,13 @@ def command_watch(args):
 
 # ------------------------------------------------------------------- Figure 9 and agreement
 
+def pyplot_for(path):
+    """matplotlib.pyplot; UserError, before the work, if no picture can be written there."""
+    fac.need(Path(path).suffix == ".png" and not Path(path).is_dir(),
+             f"{path}: expected the name of a .png file")
+    return fac.pyplot()
+
+
 SMOOTH = 10  # decisions over which a change of the return counts
 
 
@@ -184,7 +191,7 @@ def frames_at(task, seed, actions, moments):
 def command_figure9(args):
     """figure9: latents by joint, and what each joint contributes in the best and worst episode."""
     model, header, task = open_model(args)
-    plt, began = fac.pyplot(), time.time()
+    plt, began = pyplot_for(args.out), time.time()
     config = fac.PlannerConfig(**fac.made_for(header, args.model))
     seeds = fac.episode_seeds(args.seed, args.episodes)
     obs, actions, rewards, _ = fac.play(model, task, config, seeds)
@@ -194,11 +201,11 @@ def command_figure9(args):
     figure, grid = plt.subplots(3, 3, figsize=(11, 9), layout="constrained")
     for ax, points, name in ((grid[0, 0], tsne, "t-SNE"), (grid[0, 1], pca, "PCA")):
         for i in range(len(z)):
-            ax.scatter(*points[joints == i].T, s=7, marker="os^Dv<>p"[i % 8], label=f"joint {i}")
+            ax.scatter(*points[joints == i].T, s=7, marker="os^Dv<>p"[i % 8], label=f"agent {i}")
         ax.set(title=f"latents, {name}", xticks=[], yticks=[])
     grid[0, 2].axis("off")
     title = "black: the sum" if apart is None else (
-        f"black: the sum\nsilhouette by joint {apart:.2f}\njoints shuffled {shuffled:.2f}")
+        f"black: the sum\nsilhouette by agent {apart:.2f}\nagents shuffled {shuffled:.2f}")
     grid[0, 2].legend(*grid[0, 1].get_legend_handles_labels(), loc="upper left",
                       ncols=1 + len(z) // 8, title=title)
     moments = {}
@@ -224,7 +231,7 @@ def command_figure9(args):
               "return_worst": float(returns.min()), "moments": moments,
               "seconds": round(time.time() - began, 1)}
     if apart is not None:
-        print(f"silhouette by joint {apart:.2f}, shuffled {shuffled:.2f}")
+        print(f"silhouette by agent {apart:.2f}, shuffled {shuffled:.2f}")
     print(args.out)
     return result
 
@@ -248,14 +255,18 @@ def command_agreement(args):
     """agreement: which joint's share ranks its actions as the expert's Q does, and when."""
     student, header, args.task = open_model(args)
     (expert, _, replay, _), task = fac.load_data(args), args.task
-    theirs, *_ = header.get("data") or [None]
-    fac.need(theirs in (None, fac.checksum(expert.params.values())), f"{args.model}: was distilled "
-             f"from another expert; name it with --expert")
+    crc = [fac.checksum(arrays) for arrays in (
+        expert.params.values(), (replay.observation, replay.action, replay.ends))]
+    data, weight = header.get("data", crc), expert.params["_encoder.0.weight"]
+    frozen = student.params.get("_expert_encoder.0.weight", weight)  # a student's copy
+    fac.need(isinstance(data, list) and data[:2] == crc and np.array_equal(frozen, weight),
+             f"{args.model}: was distilled from another expert or replay; name them with --expert "
+             "and --replay")
     fac.check_task(replay, task, f"{replay.path} (--replay)")
-    plt, rng = fac.pyplot(), np.random.default_rng(args.seed)
+    plt, rng = pyplot_for(args.out), np.random.default_rng(args.seed)
     config = fac.PlannerConfig(**fac.made_for(header, args.model))
-    _, held_out = replay.starts(1, header.get("distill", {}).get("held_out",
-                                                                 fac.DistillConfig.held_out))
+    about = {k: v for k, v in (header.get("distill") or {}).items() if k == "held_out"}
+    _, held_out = replay.starts(1, fac.from_dict(fac.DistillConfig, about, args.model).held_out)
     obs, actions = replay.sequences(rng.choice(held_out, args.states), 1)
     known = agreement(student, expert, obs, actions[0], rng)
     played, done, rewards, _ = fac.play(student, task, config,
@@ -267,7 +278,8 @@ def command_agreement(args):
     when = own.reshape(len(own), -1, width).mean(2)
     figure, ax = plt.subplots(figsize=(8, 3.6), layout="constrained")
     for j, line in enumerate(when):
-        ax.plot(np.arange(len(line)) * width + width / 2, line, label=f"joint {j}")
+        ax.plot(np.arange(len(line)) * width + width / 2, line, marker="os^Dv<>p"[j % 8],
+                label=f"joint {j}")
     ax.set(xlabel="decision", ylabel="rank correlation with the expert's Q", ylim=(None, 1),
            title=f"{task}, the worst of {args.episodes} episodes: {rewards[worst].sum():.0f}")
     ax.legend(ncols=1 + len(own) // 8)

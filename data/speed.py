@@ -13,6 +13,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import fac_tdmpc_ref as fac  # noqa: E402
+from look import pyplot_for  # noqa: E402
 
 # robot: dim O, dim A (Figure 3), milliseconds of f_T, f_R, f_Q in TD-MPC and in Fac-TDMPC (Table 3)
 ROBOTS = {
@@ -193,13 +194,8 @@ def command_table3(args):
     """table3: the networks and whole decisions on this machine."""
     planning = fac.from_args(fac.PlannerConfig, args, **fac.paper_preset(fac.PlannerConfig))
     args.robots = list(dict.fromkeys(args.robots))
-    for robot in args.robots:
-        if robot not in ROBOTS:
-            raise fac.UserError(f"unknown robot {robot!r}; known: {', '.join(ROBOTS)}")
-    if args.runs < 10:
-        raise fac.UserError(f"--runs must be at least 10, not {args.runs}")
     if args.figure:
-        fac.pyplot()  # before the work, not after it
+        pyplot_for(args.figure)
     prediction, decision, hand_overs = [], [], []
     for robot in args.robots:
         agents = ROBOTS[robot][1]

@@ -32,6 +32,7 @@ TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
 NOT_ONLINE = ("steps", "batch_size", "reuse", "new_targets", "own_episodes", "own_share",
               "held_out")  # settings of distill that say nothing where an expert still learns
 FOLLOWING_DEFAULTS = {"noise_samples": 3}
+TORCH_ONLY = {"device": None, "precision": "float32", "threads": 1}  # and their defaults
 LOSSES = ("consistency", "reward", "value", "kl_reward", "kl_value")
 CURVE = ("decisions", "updates", "seconds", "exploration_std", "horizon", "return_mean",
          "return_min", "return_max", *LOSSES, "eval_expert", "eval_student")
@@ -208,7 +209,7 @@ def make_learner(args, sizes, config):
     model = fac.WorldModel.create(sizes, rng, policy=True)
     try:
         return TorchLearner(model, config, args.device, args.precision)
-    except (AssertionError, RuntimeError) as error:  # no such device, or none here
+    except (AssertionError, RuntimeError, ImportError) as error:  # no such device, or none here
         raise fac.UserError(f"--device {args.device}: {str(error).splitlines()[0]}") from None
 
 
@@ -458,10 +459,12 @@ def read_settings(args):
                             f"max_std ({planning.min_std}, {planning.max_std}), not "
                             f"{config.std_start}")
     quota = args.envs * fac.EPISODE_STEPS
-    if args.steps < quota:
-        raise fac.UserError(f"--envs {args.envs} needs at least --steps {quota}, not "
-                            f"{args.steps}")
-    args.steps -= args.steps % quota  # whole rounds
+    fac.need(args.steps and args.steps % quota == 0, f"--envs {args.envs} needs --steps of whole "
+             f"rounds of {quota}, not {args.steps}")
+    fac.need(args.student or args.num_agents is None, "--num-agents needs --student")
+    for name, default in TORCH_ONLY.items():
+        fac.need(args.backend == "torch" or getattr(args, name) == default,
+                 f"--{name} needs --backend torch")
     _, _, _, dim_action = fac.lookup_task(args.task)
     if not args.student:
         return config, planning, None

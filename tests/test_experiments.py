@@ -221,7 +221,7 @@ def test_dask_gives_the_rows_that_processes_give(tmp_path):
     here = rows_of(tmp_path / "sweep.csv")
     os.environ["PYTHONPATH"] = str(ROOT / "data")
     try:
-        with distributed.LocalCluster(n_workers=1, threads_per_worker=1,
+        with distributed.LocalCluster(n_workers=2, threads_per_worker=1,
                                       dashboard_address=None) as cluster:
             last_json(run(*flags, "--out", "dask.csv", "--backend", "dask", "--scheduler",
                           cluster.scheduler_address, "--json", cwd=tmp_path))
@@ -440,11 +440,12 @@ def test_the_cases_of_figure_5_learn_what_they_say():
     assert set(kinds.values()) == {fac.Distiller} and len(kinds) == 6
 
 
-def test_runs_of_other_settings_don_t_make_one_figure(tmp_path):
+@pytest.mark.parametrize("seeds", [(0, 0), (0, 1)])
+def test_runs_of_other_settings_don_t_make_one_figure(tmp_path, seeds):
     path = tmp_path / "figure4.csv"
-    write_rows(path, [("walker-run", 0, "TAP", {"episodes": n}, [
-        {"step": 1, "return_mean": 1.0, "minutes": 1.0}]) for n in (5, 10)])
-    with pytest.raises(fac.UserError, match="TAP of walker-run, seed 0.*'episodes': 10"):
+    write_rows(path, [("walker-run", seed, "TAP", {"episodes": n, "weights": seed}, [
+        {"step": 1, "return_mean": 1.0, "minutes": 1.0}]) for n, seed in zip((5, 10), seeds)])
+    with pytest.raises(fac.UserError, match="TAP of walker-run was made with .*'episodes': 10"):
         experiments.settled(path)
     assert len(experiments.settled(path, ("episodes",))) == 2
 
