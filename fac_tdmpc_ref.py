@@ -135,8 +135,8 @@ class ModelConfig(Settings):
 @dataclass(frozen=True)
 class PlannerConfig(Settings):
     """MPPI. Raises UserError for values that can't plan."""
-    samples: int = field(128, "S: action sequences drawn in an iteration [D10]", paper=512, least=1)
-    iterations: int = field(4, "refinements of the Gaussian in a decision [D10]", paper=6, least=1)
+    samples: int = field(128, "S: action sequences drawn in an iteration [D5]", paper=512, least=1)
+    iterations: int = field(4, "refinements of the Gaussian in a decision [D5]", paper=6, least=1)
     elites: int = field(0, "best ones, which refine it; 0: samples / 8 (Table 2: 64)", least=0)
     pi_trajs: int = field(24, "policy proposals, where there is a policy (Table 2)", least=0)
     horizon: int = field(3, "H of Equation 2, unless the model's file names its own (Table 2)",
@@ -176,8 +176,7 @@ class DistillConfig(Settings):
     clip_actions: bool = field(True, "clip perturbed actions to [-1, 1] [D8]", paper=False)
     reuse: int = field(4, "steps that learn from a state's perturbations [D1]", paper=1, least=1)
     horizon: int = field(3, "H of loss and planning (Table 2)", least=0, most=EPISODE_STEPS - 1)
-    lam: float = field(1.0, "lambda (rho in Table 2): step h weighs lambda^h [D5]", paper=0.5,
-                       least=0)
+    lam: float = field(0.5, "lambda (rho in Table 2): step h weighs lambda^h", least=0)
     reward_coef: float = field(0.5, "weight of the rewards' divergence (Table 2)", least=0)
     value_coef: float = field(0.1, "weight of each Q's divergence (Table 2)", least=0)
     temperature_student: float = field(0.5, "T_s of Equation 4 (authors' code)", above=0)
@@ -552,8 +551,7 @@ def run_heads(model, x, actions, tapes=None):
 def predict_backward(model, tapes, d_outputs, grads, d_latents=None):
     """Walk `unroll` and `run_heads` back; adds to `grads`, returns dz (N, m, B).
 
-    d_outputs: gradients of the three outputs; d_latents (L, N, m, B * K): of s_1, ..., s_L, where
-    there were L transitions."""
+    d_outputs: gradients of the three outputs; d_latents (L, N, m, B * K): of s_1, ..., s_L."""
     n, m = model.config.num_agents, model.config.latent_dim
     (L, B, K), dx = d_outputs[0].shape, 0
     columns = B * K
@@ -672,10 +670,9 @@ class Distiller:
         need((replay.dim_obs, replay.dim_action) == (theirs.dim_obs, theirs.dim_action),
              f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, {replay.dim_action}), the "
              f"expert expects ({theirs.dim_obs}, {theirs.dim_action}); pass its own task's replay")
-        self.expert, self.config, self.seed = expert, config, seed
+        self.expert, self.replay, self.config, self.seed = expert, replay, config, seed
         need(expert.has_policy or not config.own_episodes, "the expert has no policy, which says "
              "what to do in the student's own states; pass --own-episodes 0")
-        self.replay = replay
         self.own = np.zeros((0, EPISODE_STEPS, replay.dim_obs + replay.dim_action), np.float16)
         agents = theirs.dim_action if num_agents is None else num_agents
         with one_thread():
@@ -702,9 +699,8 @@ class Distiller:
             obs[:, is_own] = played[0, :dim_obs]
         renew_targets(self.replay.header.get("task"), obs, self.config.new_targets, rng)
         if count:  # copies of what the student did and, as many, of what the policy would do
-            theirs = policy_rollout(self.expert, self.expert.encode(obs[:, is_own]),
-                                    [F32(0)] * L)[:, 0]
-            actions[:, :, is_own] = np.where(rng.random((count, K)) < 0.5, theirs[..., None],
+            pi = policy_rollout(self.expert, self.expert.encode(obs[:, is_own]), [F32(0)] * L)[:, 0]
+            actions[:, :, is_own] = np.where(rng.random((count, K)) < 0.5, pi[..., None],
                                              played[:, dim_obs:, :, None])
         return perturbed_batch(self.expert, self.student, obs, actions, self.config, rng)
 
@@ -1530,10 +1526,8 @@ def play(model, task, config, seeds, workers=None, label="playing"):
 
 
 def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="evaluating"):
-    """Returns of `episodes` episodes, played side by side in `workers` processes (see `play`).
-
-    Gives {"returns", "plan_ms_median" (over episodes, of a mean decision)}. Raises UserError if the
-    model isn't for the task."""
+    """{"returns", "plan_ms_median" (over episodes, of a mean decision)} of `episodes` episodes, as
+    `play` plays them. Raises UserError if the model isn't for the task."""
     check_task(model.config, task)
     seeds = episode_seeds(seed, episodes)
     _, _, rewards, seconds = play(model, task, config, seeds, workers, label)
@@ -1940,8 +1934,7 @@ class Parser(argparse.ArgumentParser):
 def make_parser():
     """The command line, generated from the configs of section 1."""
     parser = Parser(prog="fac_tdmpc_ref.py", description="Fac-TDMPC in NumPy: distil a TD-MPC "
-                    "expert into one small world model for each joint, and plan with them in "
-                    "parallel.")
+                    "expert into one small world model for each joint, and plan with them.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     positive = functools.partial(natural, least=1)
 

@@ -792,14 +792,11 @@ def make_parser():
     sub = fac.add_command(
         commands, "table3", command_table3, "Planning speed: Table 3 (the networks) and whole "
         "decisions, centralized and factored, by threads and processes.",
-        epilog="Fresh weights: speed doesn't depend on what a model has learned. Keep the machine "
-        "quiet, and read ratios.")
+        epilog="Fresh weights: as fast as learned ones. Keep the machine quiet, and read ratios.")
     sub.add_argument("--robots", nargs="+", default=list(ROBOTS), choices=ROBOTS, metavar="ROBOT",
                      help="some of: " + ", ".join(ROBOTS) + " [all]")
-    sub.add_argument("--workers", type=fac.natural, help="processes beside this one, at most one "
-                     "for each further agent [as many as there are cores for]")
-    sub.add_argument("--runs", type=ten, default=100, help="of each network; decisions are timed a "
-                     "tenth as often [100]")
+    sub.add_argument("--workers", type=fac.natural, help="beside this process [as many as help]")
+    sub.add_argument("--runs", type=ten, default=100, help="timings; of decisions a tenth [100]")
     sub.add_argument("--figure", help="draw Figure 6 into this file")
     fac.add_config(sub, fac.PlannerConfig, **fac.paper_preset(fac.PlannerConfig))
     def add_runs(name, run, help, tasks, **defaults):
