@@ -528,7 +528,7 @@ def test_a_killed_run_whose_student_plays_goes_on(tmp_path, files, no_plots):
     for stop in (3, 5):  # the student plays before steps 2, 3 and 5, counted from 0
         assert distill("parts", "--workers", "2", stop=stop).returncode == -signal.SIGKILL
     with np.load(tmp_path / "parts" / "checkpoint.npz") as file:
-        assert file["own"].shape == (4 * fac.EPISODE_STEPS, 8)
+        assert file["own"].shape == (4, fac.EPISODE_STEPS, 8 + 3)  # states and actions
     succeeded(distill("parts"))
     assert student_of(tmp_path / "parts") == student_of(tmp_path / "whole")
     without = distill_arguments(files, "--out", tmp_path / "without")
