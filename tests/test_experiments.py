@@ -388,6 +388,20 @@ def test_the_action_vae_finds_a_plane():
     assert ((back - x[4:]) ** 2).mean() < 0.05 * x[4:].var()
 
 
+def test_tap_learns_from_the_robot_s_actions_of_its_own_episodes():
+    expert, _ = fac.load_model(fac.data_file("reacher-hard", "expert.npz"))
+    replay, rng = fac.Replay(fac.data_file("reacher-hard", "replay.npz")), np.random.default_rng(0)
+    config = fac.DistillConfig(steps=8, batch_size=8)
+    with contextlib.closing(tap.TapDistiller(expert, replay, config, vae_steps=10)) as distiller:
+        obs = rng.uniform(-1, 1, (2, fac.EPISODE_STEPS, 8))
+        u = rng.uniform(-1, 1, (2, fac.EPISODE_STEPS, 2)).astype(np.float32)
+        distiller.add(obs, u)
+        s = expert.encode(obs[1, 7][:, None])[0]
+        expected = distiller.vae.decode(s, u[1, 7][:, None])[:, 0]
+        assert np.allclose(distiller.own[1, 7, 8:], expected, atol=1e-3)
+        assert np.isfinite(distiller.step()).all()
+
+
 def test_a_disturbed_robot():
     def step(kind, action, joint=0):
         environment = experiments.DisturbedEnvironment("walker-walk", joint, kind)
