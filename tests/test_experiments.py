@@ -459,7 +459,8 @@ def test_runs_of_other_settings_don_t_make_one_figure(tmp_path, seeds):
     path = tmp_path / "figure4.csv"
     write_rows(path, [("walker-run", seed, "TAP", {"episodes": n, "weights": seed}, [
         {"step": 1, "return_mean": 1.0, "minutes": 1.0}]) for n, seed in zip((5, 10), seeds)])
-    with pytest.raises(fac.UserError, match="TAP of walker-run was made with .*'episodes': 10"):
+    expected = rf"TAP of walker-run was made with .*, seed {seeds[1]}, with .*'episodes': 10"
+    with pytest.raises(fac.UserError, match=expected):
         experiments.settled(path)
     assert len(experiments.settled(path, ("episodes",))) == 2
 
