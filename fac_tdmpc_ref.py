@@ -2,11 +2,10 @@
 
 A TD-MPC expert (encoder, dynamics, reward, value; planning by MPPI in latent space) is distilled
 into a student whose latent state, dynamics, reward and value fall apart into one small model for
-each action dimension. Each joint then plans alone: cheaper, and in parallel. What that keeps of
-the return is measured, in the README. This file holds the method: networks with hand-written
-gradients, Adam, Algorithm 1 (Equation 4), MPPI (Equations 2 and 3), planning workers,
-environments, files and two commands. What uses it is in data/: training experts (Equation 1), the
-paper's experiments, checkpoints from elsewhere.
+each action dimension. Each joint then plans alone: cheaper, and in parallel. This file holds the
+method: networks with hand-written gradients, Adam, Algorithm 1 (Equation 4), MPPI (Equations 2 and
+3), planning workers, environments, files and two commands. What uses it is in data/: training
+experts (Equation 1), the paper's experiments, checkpoints from elsewhere.
 
     python fac_tdmpc_ref.py distill --task reacher-hard
     python fac_tdmpc_ref.py evaluate --model runs/reacher-hard-0/student.npz
@@ -1458,6 +1457,12 @@ def checksum(arrays):
     return functools.reduce(lambda crc, a: zlib.crc32(np.ascontiguousarray(a), crc), arrays, 0)
 
 
+def data_checksums(expert, replay):
+    """What a student was distilled from: of weights and transitions; and the replay's task."""
+    return [checksum(expert.params.values()),
+            checksum([replay.observation, replay.action, replay.ends]), replay.header.get("task")]
+
+
 def data_file(task, name):
     """data/<task>/<name>; UserError that says what to do if it isn't there."""
     lookup_task(task)
@@ -1764,11 +1769,8 @@ def distil_and_save(distiller, args, planning, header, out):
     student, config, replay = distiller.student, distiller.config, distiller.replay
     playing = dataclasses.replace(planning, **OWN_BUDGET)
     settings = {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
-                "distill": asdict(config),
-                "own_planner": asdict(playing) if config.own_episodes else None,
-                "data": [checksum(distiller.expert.params.values()),
-                         checksum([replay.observation, replay.action, replay.ends]),
-                         replay.header.get("task")]}
+                "distill": asdict(config), "data": data_checksums(distiller.expert, replay),
+                "own_planner": asdict(playing) if config.own_episodes else None}
     if (path := out / "student.npz").exists():  # a run that this one would replace
         before, _ = read_npz(path, ("student",))
         same_settings({key: before.get(key) for key in settings}, settings, path)
@@ -1808,15 +1810,13 @@ def time_both(expert, student, planning, obs):
     core; where that costs more than it saves, it counts as planning in one. Result's part."""
     beside = useful_workers(student.config.num_agents)
     with contextlib.ExitStack() as stack:
-        planners = [stack.enter_context(Planner(model, planning, workers=workers))
-                    for model, workers in ((expert, 0), (student, 0), (student, beside))]
-        seconds = interleaved_seconds([functools.partial(p.act, obs) for p in planners], 20,
-                                      "timing")
-    central, alone, parallel = (1e3 * np.median(seconds, 0)).tolist()
-    parallel = parallel if beside else alone  # which were timed twice
-    return {"plan_ms_expert": central, "plan_ms_student_in_process": alone,
-            "plan_ms_student": min(alone, parallel), "speedup": central / min(alone, parallel),
-            "plan_workers": beside if parallel < alone else 0}
+        acts = [stack.enter_context(Planner(model, planning, workers=workers)).act
+                for model, workers in ((expert, 0), *((student, n) for n in sorted({0, beside})))]
+        seconds = interleaved_seconds([functools.partial(act, obs) for act in acts], 20, "timing")
+    central, *own = (1e3 * np.median(seconds, 0)).tolist()
+    return {"plan_ms_expert": central, "plan_ms_student_in_process": own[0],
+            "plan_ms_student": min(own), "speedup": central / min(own),
+            "plan_workers": beside if min(own) < own[0] else 0}
 
 
 def report(result, planning, eval_seed):

@@ -255,11 +255,10 @@ def command_agreement(args):
     """agreement: which joint's share ranks its actions as the expert's Q does, and when."""
     student, header, args.task = open_model(args)
     (expert, _, replay, _), task = fac.load_data(args), args.task
-    crc = [fac.checksum(arrays) for arrays in (
-        expert.params.values(), (replay.observation, replay.action, replay.ends))]
-    data, weight = header.get("data", crc), expert.params["_encoder.0.weight"]
+    expected = fac.data_checksums(expert, replay)
+    data, weight = header.get("data", expected), expert.params["_encoder.0.weight"]
     frozen = student.params.get("_expert_encoder.0.weight", weight)  # a student's copy
-    fac.need(isinstance(data, list) and data[:2] == crc and np.array_equal(frozen, weight),
+    fac.need(data == expected and np.array_equal(frozen, weight),
              f"{args.model}: was distilled from another expert or replay; name them with --expert "
              "and --replay")
     fac.check_task(replay, task, f"{replay.path} (--replay)")

@@ -402,6 +402,22 @@ def test_distill_prints_json_and_a_table(distilled):
     assert "16 samples, 1 iterations, horizon 1" in table
 
 
+@pytest.mark.parametrize("cores, seconds, workers, best", [
+    (1, [4, 2], 0, 2000), (2, [4, 2, 1], 1, 1000), (2, [4, 2, 3], 0, 2000)])
+def test_distill_times_workers_only_where_there_are_cores(cores, seconds, workers, best,
+                                                          monkeypatch):
+    def timed(calls, rounds, label):
+        assert len(calls) == len(seconds)
+        assert all(call().shape == (3,) for call in calls)
+        return np.array([seconds])
+
+    monkeypatch.setattr(fac, "cores", lambda: cores)
+    monkeypatch.setattr(fac, "interleaved_seconds", timed)
+    found = fac.time_both(random_model(1), random_model(), fac.PlannerConfig(8, 1), np.zeros(8))
+    assert (found["plan_workers"], found["plan_ms_student"]) == (workers, best)
+    assert (found["plan_ms_student_in_process"], found["speedup"]) == (2000, 4000 / best)
+
+
 def test_distill_shows_its_progress(distilled):
     done, _ = distilled
     for part in ("distilling", "loss", "KL reward", "value", "step/s", "evaluating the student",
