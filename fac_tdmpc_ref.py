@@ -14,7 +14,7 @@ The one idea that keeps it small: every model carries an agent axis N, and a cen
 the case N = 1. There is one world model, one planner, one loss. The axes, everywhere:
 
     N   agents: 1 in TD-MPC; dim(A), or any divisor of it, in Fac-TDMPC
-    m   latent features of an agent
+    m   latent features of an agent; a latent, the paper's s, is z (N, m, B) in the code
     d   action dimensions of an agent: dim(A) / N
     O   observation features;   A = N * d   action dimensions
     B   batch;   S   action sequences (the last axis)
@@ -144,7 +144,7 @@ class PlannerConfig(Settings):
                             least=0, most=1)
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)", above=0)
     max_std: float = field(2.0, "first and largest sampling deviation (Table 2)", above=0)
-    inverse_temperature: float = field(0.5, "an elite weighs exp(this * G); the `temperature` of "
+    inverse_temperature: float = field(0.5, "an elite weighs exp(this * return); `temperature` of "
                                        "Table 2, by which TD-MPC's code multiplies", above=0)
     momentum: float = field(0.1, "part of the old mean in the new (TD-MPC's code)", least=0, most=1)
     returns: str = field("fast", "Equation 2 as it reads (plain: h_step_return), or the same, fast",
@@ -238,7 +238,7 @@ def student_config(expert, num_agents, sizes, encoder_input):
 
 # ==== 2. Layers: each forward beside its backward =====================================
 
-# Networks of TD-MPC's TOLD as layer kinds. A layer's place is its index in the official state
+# The networks of TD-MPC as layer kinds. A layer's place is its index in the official state
 # dict: layer 3 of the first Q is `_Q1.3.weight`, `_Q1.3.bias`.
 ENCODER = ("linear", "elu", "linear")
 MLP = ("linear", "elu", "linear", "elu", "linear")
@@ -293,7 +293,7 @@ def standardize(x):
 
 
 def norm(x, g, b):
-    """LayerNorm: y = g x_hat + b.  x (N, F, B), g and b (N, F, 1)."""
+    """LayerNorm: y = g x_hat + b.  x (N, in, B), g and b (N, in, 1)."""
     return g * standardize(x)[0] + b
 
 
@@ -517,8 +517,8 @@ def unroll(model, z, actions, transitions, tapes=None):
 
     z (N, m, B), actions (L, A, B, K): K perturbed copies of a trajectory. Returns the networks'
     input x (N, m + d, L * B * K), columns in the order (L, B, K), with s_{h+1} = f_T(s_h, a_h),
-    and the latents (N, m, B * K) after the last of `transitions`: L - 1 for Equation 4, L for
-    Equation 1. tapes: for `predict_backward`, a list for each network and transition."""
+    and the latents (N, m, B * K) after the last of `transitions`, if any: L - 1 for Equation 4, L
+    for Equation 1. tapes: for `predict_backward`, a list for each network and transition."""
     L, _, B, K = actions.shape
     n, m, d = model.config.num_agents, model.config.latent_dim, model.config.agent_actions
     columns = B * K
@@ -579,8 +579,8 @@ def log_softmax(x):
 def soft_kl(student, expert, temperature_student, temperature_expert, kind="forward"):
     """D(p_e || p_s) of p_e = softmax(expert / T_e) and p_s = softmax(student / T_s), Equation 4.
 
-    student, expert (..., K): predictions for the K perturbed actions of a state. "reverse" is
-    D(p_s || p_e) [D2]. Returns the divergence (...) and its gradient by `student` (..., K)."""
+    student, expert (..., K): predictions for K perturbed copies of a state's actions. "reverse"
+    is D(p_s || p_e) [D2]. Returns the divergence (...) and its gradient by `student` (..., K)."""
     log_s = log_softmax(student / temperature_student)
     log_e = log_softmax(expert / temperature_expert)
     p_s, p_e = np.exp(log_s), np.exp(log_e)
@@ -631,7 +631,7 @@ def new_student(expert, sizes, seed):
 
 
 def learning_rate(config, t):
-    """Linear rise over `warmup` steps, then constant or half a cosine down to zero [D1]."""
+    """A linear rise over `warmup` steps, times one or half a cosine down to zero [D1]."""
     rate = config.lr * min(1.0, (t + 1) / max(1, config.warmup))
     if config.lr_schedule == "cosine":
         rate *= 0.5 * (1 + np.cos(np.pi * min(1.0, t / config.steps)))
@@ -696,8 +696,8 @@ class Distiller:
             t = rng.integers(EPISODE_STEPS - L + 1, size=count) + np.arange(L)[:, None]
             played = self.own[episode, t].swapaxes(1, 2).astype(F32)  # (L, O + A, count)
             obs[:, is_own] = played[0, :dim_obs]
-        renew_targets(self.replay.header.get("task"), obs, self.config.new_targets, rng)
-        if count:  # copies of what the student did and, as many, of what the policy would do
+        renew_targets(self.replay.header.get("task"), obs, self.config.new_targets, rng)  # [D7]
+        if count:  # a coin for each copy: what the student did, or what the policy would do
             pi = policy_rollout(self.expert, self.expert.encode(obs[:, is_own]), [F32(0)] * L)[:, 0]
             actions[:, :, is_own] = np.where(rng.random((count, K)) < 0.5, pi[..., None],
                                              played[:, dim_obs:, :, None])
@@ -923,7 +923,7 @@ class Planner(contextlib.AbstractContextManager):
     workers: processes beside this one; each plans for a part of the agents (0: all here).
     Every agent owns its random stream and one BLAS thread computes each product, so the plan
     is the same, bit for bit, for every number of workers. Raises WorkerError when a worker
-    has died. Weights are copied: make a new one when they have changed."""
+    has died. Some weights are copied: make a new one when they have changed."""
 
     def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
         self.model, self._parts = model, split_agents(model.config.num_agents, workers)
@@ -1082,7 +1082,7 @@ def split_agents(agents, workers):
 
 
 def cores():
-    """Cores that this process may use, where the system tells (taskset, containers)."""
+    """Cores that this process may use, where the system tells (taskset, cpusets)."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -1161,9 +1161,8 @@ class Workers(contextlib.AbstractContextManager):
             connection.close()
         for process, _ in self._members:
             process.join(0.2)
-            if process.is_alive():
-                process.kill()
-                process.join()
+            process.kill()  # does nothing to one that has ended
+            process.join()
 
     def __exit__(self, *_):
         self.close()
@@ -1328,8 +1327,7 @@ def atomic_file(path, mode="wb", **options):
         raise UserError(f"{path}: can't be written: {error.strerror or error}") from error
     finally:
         if temporary:
-            with contextlib.suppress(FileNotFoundError):
-                os.unlink(temporary)
+            Path(temporary).unlink(missing_ok=True)
 
 
 def write_npz(path, header, arrays, compress=False):
@@ -1458,7 +1456,7 @@ def checksum(arrays):
 
 
 def data_checksums(expert, replay):
-    """What a student was distilled from: of weights and transitions; and the replay's task."""
+    """Of the expert's weights and of the replay's transitions; then the task that it names."""
     return [checksum(expert.params.values()),
             checksum([replay.observation, replay.action, replay.ends]), replay.header.get("task")]
 
@@ -1761,7 +1759,9 @@ def load_data(args):
              f"{header.get(key)!r}")
     check_task(expert.config, args.task)
     Environment(args.task)  # what is missing is missed now, not after the last step
-    return expert, header, Replay(args.replay or path.with_name("replay.npz")), path
+    replay = Replay(args.replay or path.with_name("replay.npz"))
+    replay.header.setdefault("task", args.task)  # whose targets can be renewed [D7]
+    return expert, header, replay, path
 
 
 def distil_and_save(distiller, args, planning, header, out):

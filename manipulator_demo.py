@@ -9,8 +9,8 @@ what differs is the model of the world that it imagines with:
 
 `python manipulator_demo.py` compares them and checks appendix A.1 by machine, in seconds.
 
-Axes: N agents, H horizon, d action dimensions and s state features of an agent, E elites, S samples
-(always last); `...` is N or nothing. Angles in radians, lengths in the links' unit, equation
+Axes: N agents, H horizon, d action dimensions and s state features of an agent, S samples (always
+last); `...` is N, goals or nothing. Angles in radians, lengths in the links' unit, equation
 numbers as in the paper. One step is 0.1 s (Table 1: freq 10).
 """
 
@@ -110,10 +110,10 @@ def actuate(theta, action, low, span):
 # 2. The two models ====================================================================
 
 class CentralizedModel:
-    """The MDP over tip positions: s = 2, d = 3 (Figure 1b). With N > 1 every agent has an arm."""
+    """The MDP over tip positions: N = 1, s = 2, d = 3 (Figure 1b)."""
 
-    def __init__(self, solver=inverse_kinematics, agents=1):
-        self.solver, self.agents, self.action_dim = solver, agents, 3
+    def __init__(self, solver=inverse_kinematics):
+        self.solver, self.agents, self.action_dim = solver, 1, 3
 
     def observe(self, theta):
         """Angles of the real arm (3,) -> state (1, 2)."""
@@ -459,8 +459,8 @@ def print_appendix(result):
     fac.print_table([("Eq.", "relative error", "derivative > 0"), *rows])
     share, sign = result["monotonic_share"], result["monotonic_by_sign"]
     print(f"""\
-misprints: f_FK lacks y; Eq. 20 to 22 lost a sqrt(c_e): 22 is 2 sqrt(c_e) (L3 + L2 cos c3), positive
-only while cos c3 > -L3/L2. Eq. 23 is positive only while L3 + L2 cos c3 + L1 cos(c2 + c3) > 0
+misprints: f_FK lacks y; Eq. 20 to 22 print an L3 for sqrt(c_e): 22 is 2 sqrt(c_e) (L3 + L2 cos c3),
+positive only while cos c3 > -L3/L2; 23 is, only while L3 + L2 cos c3 + L1 cos(c2 + c3) > 0
 
 'monotonic near the goal': share of joint-error directions e in which c_e rises with
   {', '.join(f'|e{i + 1}| {v:.2f}' for i, v in enumerate(share['three']))}, all three \

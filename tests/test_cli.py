@@ -1,4 +1,4 @@
-"""Tests of section 9: the command line as users run it, on a small expert and replay made here."""
+"""Tests of section 8: the command line as users run it, on a small expert and replay made here."""
 
 import csv
 import dataclasses

@@ -1,4 +1,4 @@
-"""Tests of section 8 (weights, replay, files) and of `from_dict`, which reads their headers."""
+"""Tests of section 7 (weights, replay, files) and of `from_dict`, which reads their headers."""
 
 import errno
 import json

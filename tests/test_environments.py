@@ -1,4 +1,4 @@
-"""Tests of section 7: the paper's 11 tasks as MuJoCo really runs them, and hindsight targets."""
+"""Tests of section 6: the paper's 11 tasks as MuJoCo really runs them, and hindsight targets."""
 
 import functools
 import os

@@ -273,8 +273,9 @@ def run_once(model, seed, steps=100, discount=1.0):
 def run_side_by_side(solver, discount, seeds, steps):
     """Centralized runs of many seeds as one planner of many agents, each with an arm of its own:
     the solver's iterations are shared. (3, seeds, steps + 1)"""
-    run = demo.Run("", demo.CentralizedModel(solver, len(seeds)),
-                   replace(demo.TABLE_1, discount=discount), seed=0)
+    model = demo.CentralizedModel(solver)
+    model.agents = len(seeds)
+    run = demo.Run("", model, replace(demo.TABLE_1, discount=discount), seed=0)
     run.rngs = [np.random.default_rng(seed).spawn(1)[0] for seed in seeds]
     theta = [np.repeat(demo.START_ANGLES[:, None], len(seeds), axis=1)]
     for _ in range(steps):
