@@ -7,7 +7,7 @@
 
 Figures 4, 5, 7, 8, 12, 13, departures and `sweep` are lists of runs, each a task, a seed, a case
 and settings. Rows go to one CSV under data/results as runs end; the same command again makes those
-that are missing. `report` draws them, from the CSVs and the experts' records. Table 3 is in
+that are missing. `report` draws all but sweeps, from CSVs and the experts' records. Table 3 is in
 speed.py, TAP in tap.py, section 5.6 in look.py: clients, of which fac_tdmpc_ref.py knows nothing.
 """
 import contextlib
@@ -258,7 +258,7 @@ def distiller_of(case):
 def distil(task, seed, case, settings):
     """Distil a student; a row at each evaluation. settings: of DistillConfig, and `num_agents`,
     `evaluations` on the way, of so many `episodes`, planned with `samples` and `iterations`;
-    `data`: a checksum, which tells apart what it is learned from."""
+    `data`: checksums, which tell apart what it is learned from."""
     settings.pop("data", None)
     own = {k: settings.pop(k, v) for k, v in (("num_agents", None), ("evaluations", 1),
                                               ("episodes", 10))}
@@ -311,17 +311,16 @@ def distil_runs(args, cases):
     """A run for each seed and task, and each (case, settings) of cases(task)."""
     budget = {k: getattr(args, k) for k in ("steps", "evaluations", "episodes", "samples",
                                             "iterations")}
-    data = {task: data_checksum(task) for task in args.tasks}
+    data = {task: data_checksums(task) for task in args.tasks}
     return [make_run(task, seed, case, data=data[task], **{**budget, **settings})
             for seed, task in itertools.product(args.seeds, args.tasks)
             for case, settings in cases(task)]
 
 
-def data_checksum(task):
-    """Of a task's expert and replay."""
+def data_checksums(task):
+    """Of a task's expert and replay, as a student's file names them."""
     expert, _ = fac.load_model(fac.data_file(task, "expert.npz"))
-    replay = fac.Replay(fac.data_file(task, "replay.npz"))
-    return fac.checksum([*expert.params.values(), replay.observation, replay.action])
+    return fac.data_checksums(expert, fac.Replay(fac.data_file(task, "replay.npz")))
 
 
 def command_figure4(args):
@@ -507,7 +506,7 @@ def follow(task, seed, case, settings):
         rows = [row for row in csv.DictReader(file) if row["eval_student"]]
     for row in rows:
         yield {"step": row["decisions"], "return_mean": float(row["eval_student"]),
-               "expert_mean": float(row["eval_expert"]), "minutes": float(row["seconds"]) / 60}
+               "expert_mean": float(row["eval_expert"])}
 
 
 def command_figure12(args):
@@ -791,7 +790,7 @@ def make_parser():
     positive, several, ten = (functools.partial(fac.natural, least=n) for n in (1, 2, 10))
     sub = fac.add_command(
         commands, "table3", command_table3, "Planning speed: Table 3 (the networks) and whole "
-        "decisions, centralized and factored, by threads and processes.",
+        "decisions, centralized and factored, in one process and in several.",
         epilog="Fresh weights: as fast as learned ones. Keep the machine quiet, and read ratios.")
     sub.add_argument("--robots", nargs="+", default=list(ROBOTS), choices=ROBOTS, metavar="ROBOT",
                      help="some of: " + ", ".join(ROBOTS) + " [all]")
@@ -815,7 +814,7 @@ def make_parser():
             sub.add_argument("--steps", type=positive, default=defaults["steps"],
                              help="gradient steps [%(default)s; paper: 100000]")
             sub.add_argument("--evaluations", type=positive, default=defaults["evaluations"],
-                             help="of a run, evenly over its steps [%(default)s]")
+                             help="of a run at most, evenly over its steps [%(default)s]")
             for name in ("samples", "iterations"):
                 sub.add_argument(f"--{name}", type=positive, help="MPPI's, in evaluations "
                                  f"[{getattr(fac.PlannerConfig, name)}]")
@@ -823,8 +822,8 @@ def make_parser():
 
     walkers, steps = ["walker-walk", "walker-run"], fac.DistillConfig.steps
     shipped = sorted(path.parent.name for path in fac.DATA.glob("*/expert.npz"))
-    add_runs("figure4", command_figure4, "Section 5.2: Fac-TDMPC, TD-MPC as large as the "
-             "expert and a tenth of it, and TAP, by Algorithm 1; return against steps.", shipped,
+    add_runs("figure4", command_figure4, "Section 5.2: Fac-TDMPC, TD-MPC in Table 2's size "
+             "and the small one of B.2, and TAP, by Algorithm 1; return against steps.", shipped,
              steps=steps, evaluations=4)
     add_runs("figure5", command_figure5, "Section 5.3: KL against MSE, the perturbations' "
              "deviation, the student's temperature, a consistency loss.", walkers, steps=steps,
@@ -841,7 +840,8 @@ def make_parser():
         sub.add_argument("--students", default="runs", help="where distill left TASK-SEED/ [runs]")
     sub = add_runs("figure12", command_figure12, "Appendix C.1: an expert that learns and a "
                    "student that follows it.", ["reacher-easy", "walker-walk", "cheetah-run"])
-    sub.add_argument("--decisions", type=positive, default=30_000, help="of training [30000]")
+    sub.add_argument("--decisions", type=positive, default=30_000,
+                     help="of training, a multiple of 2000 [30000]")
     add_runs("figure13", command_figure13, "Appendix C.2: the number of agents.", walkers,
              steps=steps, evaluations=4)
     for name in ("figure7", "figure13"):
@@ -853,7 +853,7 @@ def make_parser():
                      help="e.g. lr=1e-3,3e-4 batch-size=16,32; see distill --help")
     sub.add_argument("--backend", choices=("loky", "dask"), default="loky", help="processes of "
                      "this machine, or a cluster whose workers (--nthreads 1) have this "
-                     "repository's data/ on their PYTHONPATH [loky]")
+                     "repository and its data/ on their PYTHONPATH [loky]")
     sub.add_argument("--scheduler", help="the cluster's, tcp://HOST:PORT")
     sub = fac.add_command(commands, "report", command_report, "Tables and figures from the CSVs: "
                           "data/results/report.md, data/figures/figure*.png.")

@@ -32,7 +32,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import fac_tdmpc_ref as fac  # noqa: E402
 from fac_tdmpc_ref import need  # noqa: E402
-from train_expert import ReplayBuffer  # noqa: E402
+from train_expert import Episode, ReplayBuffer  # noqa: E402
 
 MAX_BYTES = 1 << 29  # of a file, unpacked; a checkpoint with Table 2's sizes has 13 MB
 MAX_RATIO = 50  # unpacked bytes for each packed one, beyond the first MAX_PIECE
@@ -393,14 +393,11 @@ def collect(model, environment, episodes, seed):
         for i in range(episodes):
             rng = np.random.default_rng([seed, i])
             std, start = rng.uniform(0, MAX_NOISE), int(rng.integers(2 ** 31))
-            planner.reset(start)
-            observation, action, reward = [environment.reset(start)], [], []
-            for noise in std * rng.standard_normal((fac.EPISODE_STEPS, environment.dim_action)):
-                action.append(np.clip(planner.act(observation[-1]) + noise, -1, 1))
-                for history, value in zip((observation, reward), environment.step(action[-1])):
-                    history.append(value)
+            episode = Episode(environment, start, exploration_std=std)
+            for _ in range(fac.EPISODE_STEPS):
+                episode.play(planner, 1)
                 bar.update()
-            buffer.add(observation, action, reward)
+            buffer.add(*episode.arrays())
     return buffer
 
 
@@ -458,7 +455,7 @@ def report(result):
                   f"this again with --collect {LEAST_EPISODES}"]
     elif episodes < LEAST_EPISODES:
         lines += [f"distill holds out one episode in {LEAST_EPISODES}, of {episodes} none: give it "
-                  f"--held-out {min(0.5, 1 / episodes):.2f}, or more episodes"]
+                  f"--held-out {min(0.5, 1 / episodes):.3f}, or more episodes"]
     return "\n".join(lines)
 
 
