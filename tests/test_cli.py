@@ -402,6 +402,15 @@ def test_distill_prints_json_and_a_table(distilled):
     assert "16 samples, 1 iterations, horizon 1" in table
 
 
+def test_a_replay_that_names_no_task_is_of_the_task_it_is_used_for(tmp_path):
+    write_expert(tmp_path / "expert.npz")
+    write_replay(tmp_path / "replay.npz")
+    _, arrays = fac.read_npz(tmp_path / "replay.npz", ("replay",))
+    fac.write_npz(tmp_path / "replay.npz", {"kind": "replay"}, arrays)
+    args = fac.make_parser().parse_args(["distill", "--expert", str(tmp_path)])
+    assert fac.load_data(args)[2].header["task"] == "reacher-hard"  # so [D7] finds its targets
+
+
 @pytest.mark.parametrize("cores, seconds, workers, best", [
     (1, [4, 2], 0, 2000), (2, [4, 2, 1], 1, 1000), (2, [4, 2, 3], 0, 2000)])
 def test_distill_times_workers_only_where_there_are_cores(cores, seconds, workers, best,

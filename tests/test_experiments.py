@@ -18,6 +18,7 @@ import fac_tdmpc_ref as fac
 import look
 import speed
 import tap
+import train_expert
 from test_cli import BLOCKED, ONE_THREAD, ROOT, last_json, launch, write_expert
 from test_planning import random_model
 
@@ -318,6 +319,23 @@ def test_gradients_of_the_other_losses(kind, monkeypatch):
     for numeric, exact in slopes(lambda: kind.loss(student, features, actions, targets, config)[0],
                                  student.params, grads):
         np.testing.assert_allclose(exact, numeric, rtol=1e-5, atol=1e-8)
+
+
+def test_a_figure12_run_counts_as_finished_by_its_last_row_alone(tmp_path, monkeypatch):
+    def train(args):
+        Path(args.out).mkdir(parents=True)
+        (Path(args.out) / "curve.csv").write_text(
+            "decisions,seconds,eval_expert,eval_student\n2000,1,5,4\n4000,2,,\n6000,3,7,6\n")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train_expert, "train", train)
+    run = experiments.make_run("walker-walk", 0, "online", decisions=6000, episodes=1)
+    rows = experiments.attempt(experiments.follow, run, os.getpid())
+    assert [(row["step"], row["return_mean"], row["expert_mean"]) for row in rows] == [
+        ("2000", 4.0, 5.0), ("6000", 6.0, 7.0)]
+    for count in (1, 2):
+        experiments.append_rows(path := tmp_path / f"{count}.csv", rows[:count])
+        assert len(experiments.finished(experiments.read_rows(path))) == count - 1
 
 
 def test_consistency_vanishes_where_the_student_follows_the_expert():

@@ -3,6 +3,7 @@
 pytest tests/test_import_expert.py -k fuzz --fuzz 10000   # mutated files of each kind [250]
 """
 import collections
+import dataclasses
 import io
 import itertools
 import json
@@ -810,6 +811,18 @@ def test_few_episodes_are_pointed_out(tmp_path, capsys):
     replay.starts(2, 0.20)
     with pytest.raises(fac.UserError):
         replay.starts(2, 0.05)
+
+
+@pytest.mark.parametrize("episodes", range(2, import_expert.LEAST_EPISODES))
+def test_the_share_that_is_advised_holds_out_an_episode(tmp_path, episodes):
+    np.savez(tmp_path / "data.npz", **replay_arrays(episodes))
+    arrays = import_expert.find_replay(tmp_path / "data.npz", SIZES)
+    fac.write_npz(tmp_path / "replay.npz", {"kind": "replay"}, arrays)
+    text = import_expert.report({
+        "model": dataclasses.asdict(SIZES), "episodes": episodes, "returns": None, "out": "mine",
+        "weights": 1, "stored_as": ["float32"], "transitions": 1, "policy": True})
+    share = float(text.split("--held-out ")[1].split(",")[0])
+    assert len(fac.Replay(tmp_path / "replay.npz").starts(2, share)[1])
 
 
 def test_collected_episodes_distil_and_depend_on_the_seed_alone(tmp_path, capsys, monkeypatch):
