@@ -97,6 +97,8 @@ class Settings:
                      for bound, (words, holds) in RANGE.items() if bound in f.metadata]
             if isinstance(value, float):
                 rules.append(("finite", np.isfinite(value)))
+            elif isinstance(value, int) and value > 10 ** 9:
+                rules.append(("at most 10^9", False))
             if not all(holds for _, holds in rules):
                 self.refuse(f.name, " and ".join(words for words, _ in rules))
 
@@ -192,10 +194,8 @@ class DistillConfig(Settings):
     grad_clip: float = field(10.0, "largest gradient norm (Table 2)", above=0)
     sizes: str = field("table2", "agent sizes: table2 (m = 50) or section51 (m = 512 // N)",
                        choices=("table2", "section51"))
-    new_targets: float = field(0.5, "reacher only: share of states with a new target [D7]",
-                               paper=0.0, least=0, most=1)
-    own_episodes: int = field(16, "episodes that the student plays after each of the first three "
-                              "quarters, to learn from [D9]", paper=0, least=0)
+    own_episodes: int = field(7, "episodes that the student plays after each eighth of the steps, "
+                              "to learn from [D9]", paper=0, least=0)
     own_share: float = field(0.25, "share of states from these [D9]", paper=0.0, least=0, most=1)
     held_out: float = field(0.05, "share of episodes held out, for rank correlations",
                             least=1e-4, most=0.5)
@@ -696,9 +696,8 @@ class Distiller:
             t = rng.integers(EPISODE_STEPS - L + 1, size=count) + np.arange(L)[:, None]
             played = self.own[episode, t].swapaxes(1, 2).astype(F32)  # (L, O + A, count)
             obs[:, is_own] = played[0, :dim_obs]
-        renew_targets(self.replay.header.get("task"), obs, self.config.new_targets, rng)  # [D7]
-        if count:  # a coin for each copy: what the student did, or what the policy would do
             pi = policy_rollout(self.expert, self.expert.encode(obs[:, is_own]), [F32(0)] * L)[:, 0]
+            # a coin for each copy: what the policy would do, or what the student did
             actions[:, :, is_own] = np.where(rng.random((count, K)) < 0.5, pi[..., None],
                                              played[:, dim_obs:, :, None])
         return perturbed_batch(self.expert, self.student, obs, actions, self.config, rng)
@@ -747,9 +746,9 @@ class Distiller:
         own and returns what `add` takes; not needed without own episodes [D9]."""
         need(play or not self.config.own_episodes, "pass `play`, or configure own_episodes=0")
         while self.t < self.config.steps:
-            played, quarter = len(self.own), 4 * self.t // self.config.steps
-            if quarter * self.config.own_episodes > played:
-                self.add(*play(played, quarter * self.config.own_episodes - played))
+            played, eighth = len(self.own), 8 * self.t // self.config.steps
+            if eighth * self.config.own_episodes > played:
+                self.add(*play(played, eighth * self.config.own_episodes - played))
             yield self.step()
 
     @property
@@ -1291,21 +1290,6 @@ def training_seeds(seed, use, first, count):
     return [int(stream(seed, use, i).integers(2 ** 31)) for i in range(first, first + count)]
 
 
-def draw_targets(obs, rng):
-    """Finger-to-target (2, B) of reacher states (8, B) for targets drawn as the task draws them."""
-    heading = np.cumsum(obs[:3], 0)
-    finger = REACHER_LINK * np.stack([np.cos(heading).sum(0), np.sin(heading).sum(0)])
-    angle, radius = rng.uniform(0, 2 * np.pi, obs.shape[1]), rng.uniform(0.05, 0.2, obs.shape[1])
-    return radius * np.stack([np.cos(angle), np.sin(angle)]) - finger
-
-
-def renew_targets(task, obs, share, rng):
-    """Draw the targets of a share of reacher's states (8, B) anew, in place [D7]."""
-    if TASKS.get(str(task), " ")[0] == "reacher":
-        chosen = rng.random(obs.shape[1]) < share
-        obs[3:5, chosen] = draw_targets(obs[:, chosen], rng)
-
-
 # ==== 7. Files: weights, replay, records ==============================================
 
 DATA = Path(__file__).resolve().parent / "data"
@@ -1760,7 +1744,6 @@ def load_data(args):
     check_task(expert.config, args.task)
     Environment(args.task)  # what is missing is missed now, not after the last step
     replay = Replay(args.replay or path.with_name("replay.npz"))
-    replay.header.setdefault("task", args.task)  # whose targets can be renewed [D7]
     return expert, header, replay, path
 
 

@@ -358,9 +358,7 @@ def command_departures(args):
         tag = re.search(r"D\d+", field.metadata["help"])
         if "paper" in field.metadata and tag[0] != "D1":
             cases.setdefault(tag[0], {})[field.name] = field.metadata["paper"]
-    return distil_all(args, lambda task: [  # new targets are reacher's alone
-        (case, settings) for case, settings in cases.items()
-        if case != "D7" or task.startswith("reacher")])
+    return distil_all(args, lambda task: cases.items())
 
 
 def command_sweep(args):

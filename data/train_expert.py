@@ -29,8 +29,8 @@ from numpy_learner import ExpertConfig, Learner, named, restore  # noqa: E402
 
 # for a few cores; hidden layers of 512, as in Table 2, make an update three times as dear
 TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
-NOT_ONLINE = ("steps", "batch_size", "reuse", "new_targets", "own_episodes", "own_share",
-              "held_out")  # settings of distill that say nothing where an expert still learns
+# settings of distill that say nothing where an expert still learns
+NOT_ONLINE = ("steps", "batch_size", "reuse", "own_episodes", "own_share", "held_out")
 FOLLOWING_DEFAULTS = {"noise_samples": 3}
 TORCH_ONLY = {"device": None, "precision": "float32", "threads": 1}  # and their defaults
 LOSSES = ("consistency", "reward", "value", "kl_reward", "kl_value")
@@ -245,6 +245,14 @@ def move_target(obs, reward, back, chosen, task):
     reward[:, chosen] = fac.ACTION_REPEAT * (distance <= radius)
 
 
+def draw_targets(obs, rng):
+    """Finger-to-target (2, B) of reacher states (8, B) for targets drawn as the task draws them."""
+    heading = np.cumsum(obs[:3], 0)
+    finger = fac.REACHER_LINK * np.stack([np.cos(heading).sum(0), np.sin(heading).sum(0)])
+    angle, radius = rng.uniform(0, 2 * np.pi, obs.shape[1]), rng.uniform(0.05, 0.2, obs.shape[1])
+    return radius * np.stack([np.cos(angle), np.sin(angle)]) - finger
+
+
 def hindsight(task, buffer, where, obs, reward, rng):
     """Give three quarters of reacher's segments another target, in place [D6].
 
@@ -257,7 +265,7 @@ def hindsight(task, buffer, where, obs, reward, rng):
     episode, start = where
     later = buffer.observation[episode, rng.integers(start + 1, fac.EPISODE_STEPS + 1), 3:5]
     moved, fresh = rng.random((2, len(start))) < [[3 / 4], [1 / 3]]
-    back = np.where(fresh, obs[0, 3:5] - fac.draw_targets(obs[0], rng), later.T).T
+    back = np.where(fresh, obs[0, 3:5] - draw_targets(obs[0], rng), later.T).T
     move_target(obs.swapaxes(1, 2), reward, back.astype(np.float32), moved, task)
 
 

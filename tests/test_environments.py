@@ -328,7 +328,7 @@ def test_new_targets_lie_where_the_task_draws_them():
     rng = np.random.default_rng(0)
     obs = np.zeros((8, 4000), np.float32)
     obs[:3] = rng.uniform([[-3], [-1.4], [-1.4]], [[3], [1.4], [1.4]], (3, 4000))
-    target = fac.draw_targets(obs, rng) + finger_position(obs[:3].T).T
+    target = train_expert.draw_targets(obs, rng) + finger_position(obs[:3].T).T
     distance, angle = np.hypot(*target), np.arctan2(*target[::-1])
     assert 0.05 - 1e-6 <= distance.min() < 0.052 and 0.198 < distance.max() <= 0.2 + 1e-6
     for values, low, high in ((distance, 0.05, 0.2), (angle, -np.pi, np.pi)):
