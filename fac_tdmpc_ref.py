@@ -174,7 +174,7 @@ class DistillConfig(Settings):
     batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=2)
     noise_samples: int = field(5, "K: perturbations of each action [D1]", paper=10, least=2)
     noise_std: float = field(0.5, "deviation of the perturbations (authors' code)", above=0)
-    clip_actions: bool = field(True, "clip perturbed actions to [-1, 1] [D8]", paper=False)
+    clip_actions: bool = field(True, "clip perturbed actions to [-1, 1] [D7]", paper=False)
     reuse: int = field(4, "steps that learn from a state's perturbations [D1]", paper=1, least=1)
     horizon: int = field(3, "H of loss and planning (Table 2)", least=0, most=EPISODE_STEPS - 1)
     lam: float = field(0.5, "lambda (rho in Table 2): step h weighs lambda^h", least=0)
@@ -195,8 +195,8 @@ class DistillConfig(Settings):
     sizes: str = field("table2", "agent sizes: table2 (m = 50) or section51 (m = 512 // N)",
                        choices=("table2", "section51"))
     own_episodes: int = field(7, "episodes that the student plays after each eighth of the steps, "
-                              "to learn from [D9]", paper=0, least=0)
-    own_share: float = field(0.25, "share of states from these [D9]", paper=0.0, least=0, most=1)
+                              "to learn from [D8]", paper=0, least=0)
+    own_share: float = field(0.25, "share of states from these [D8]", paper=0.0, least=0, most=1)
     held_out: float = field(0.05, "share of episodes held out, for rank correlations",
                             least=1e-4, most=0.5)
 
@@ -641,7 +641,7 @@ def learning_rate(config, t):
 def perturbed_batch(expert, student, obs, actions, config, rng):
     """Features (1, F, B), perturbed actions (L, A, B, K) and the expert's predictions for them.
 
-    obs (O, B); actions a_h (L, A, B, K), or (L, A, B, 1): a_h + eps_h may be clipped [D8]."""
+    obs (O, B); actions a_h (L, A, B, K), or (L, A, B, 1): a_h + eps_h may be clipped [D7]."""
     noise = rng.standard_normal((*actions.shape[:3], config.noise_samples), F32)
     limit = 1 if config.clip_actions else np.inf
     perturbed = np.clip(actions + F32(config.noise_std) * noise, -limit, limit)
@@ -651,7 +651,7 @@ def perturbed_batch(expert, student, obs, actions, config, rng):
 
 
 POOL, PART = 4096, 256  # states whose expert's predictions are computed in one go, by such parts
-OWN_BUDGET = {"samples": 64, "iterations": 3, "elites": 0}  # MPPI's in own episodes [D9]
+OWN_BUDGET = {"samples": 64, "iterations": 3, "elites": 0}  # MPPI's in own episodes [D8]
 
 
 class Distiller:
@@ -690,7 +690,7 @@ class Distiller:
         K, dim_obs = self.config.noise_samples, self.replay.dim_obs
         obs, actions = self.replay.sequences(rng.choice(self.train_starts, size), L)
         actions = np.repeat(actions[..., None], K, -1)
-        is_own = rng.random(size) < (self.config.own_share if len(self.own) else 0)  # [D9]
+        is_own = rng.random(size) < (self.config.own_share if len(self.own) else 0)  # [D8]
         if count := is_own.sum():
             episode = rng.integers(len(self.own), size=count)
             t = rng.integers(EPISODE_STEPS - L + 1, size=count) + np.arange(L)[:, None]
@@ -743,7 +743,7 @@ class Distiller:
         """Algorithm 1 from here to its end; yields the losses of each step.
 
         play(first, count): lets the student play episodes first, ..., first + count - 1 of its
-        own and returns what `add` takes; not needed without own episodes [D9]."""
+        own and returns what `add` takes; not needed without own episodes [D8]."""
         need(play or not self.config.own_episodes, "pass `play`, or configure own_episodes=0")
         while self.t < self.config.steps:
             played, eighth = len(self.own), 8 * self.t // self.config.steps
@@ -757,7 +757,7 @@ class Distiller:
         return self.optimizer.t
 
     def add(self, observation, action):
-        """Let the student's episodes (E, T, O), (E, T, A) join the data [D9]; T: EPISODE_STEPS."""
+        """Let the student's episodes (E, T, O), (E, T, A) join the data [D8]; T: EPISODE_STEPS."""
         episodes = np.concatenate([observation, action], 2).astype(np.float16)
         self.own = np.concatenate([self.own, episodes])
         self._number = None  # its pool is drawn again, with them
@@ -1562,7 +1562,7 @@ def train_student(distiller, out, settings, playing, workers):
     """Algorithm 1 to its end, with a learning curve and checkpoints in the folder `out`.
 
     A run that was cut off goes on from its checkpoint and ends as if it had not been. Returns
-    (curve rows, seconds). playing, workers: how the student plays its own episodes [D9]."""
+    (curve rows, seconds). playing, workers: how the student plays its own episodes [D8]."""
     def play_own(first, count):
         seeds = training_seeds(distiller.seed, "own episode", first, count)
         return play(distiller.student, settings["task"], playing, seeds, workers,

@@ -536,7 +536,7 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(killed, distilled):
 
 
 def test_a_killed_run_whose_student_plays_goes_on(tmp_path, files, no_plots):
-    """The student's own episodes depend on its weights alone, whoever plays them [D9]."""
+    """The student's own episodes depend on its weights alone, whoever plays them [D8]."""
     def distill(out, *more, stop=-1):
         arguments = distill_arguments(files, "--own-episodes", "2", "--out", tmp_path / out, *more)
         return launch(["-c", DRIVER, stop, *arguments], tmp_path, no_plots)

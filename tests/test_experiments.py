@@ -458,10 +458,10 @@ def test_departures_are_those_that_the_settings_name(monkeypatch):
     monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: seen.extend(runs))
     assert experiments.main(["departures", "--tasks", "walker-run", "--seeds", "3"]) == 0
     found = {run["case"]: json.loads(run["settings"]) for run in seen}
-    assert set(found) == {"default", "D2", "D3", "D8", "D9"}
+    assert set(found) == {"default", "D2", "D3", "D7", "D8"}
     own = set(found["default"])
-    assert {k: v for k, v in found["D8"].items() if k not in own} == {"clip_actions": False}
-    assert found["D2"]["kl"] == "reverse" and found["D9"]["own_episodes"] == 0
+    assert {k: v for k, v in found["D7"].items() if k not in own} == {"clip_actions": False}
+    assert found["D2"]["kl"] == "reverse" and found["D8"]["own_episodes"] == 0
 
 
 def test_the_cases_of_figure_5_learn_what_they_say():
