@@ -194,8 +194,8 @@ class DistillConfig(Settings):
     grad_clip: float = field(10.0, "largest gradient norm (Table 2)", above=0)
     sizes: str = field("table2", "agent sizes: table2 (m = 50) or section51 (m = 512 // N)",
                        choices=("table2", "section51"))
-    own_episodes: int = field(7, "episodes that the student plays after each eighth of the steps, "
-                              "to learn from [D8]", paper=0, least=0)
+    own_episodes: int = field(7, "episodes that the student plays after each of the first seven "
+                              "eighths of the steps, to learn from [D8]", paper=0, least=0)
     own_share: float = field(0.25, "share of states from these [D8]", paper=0.0, least=0, most=1)
     held_out: float = field(0.05, "share of episodes held out, for rank correlations",
                             least=1e-4, most=0.5)
@@ -584,7 +584,7 @@ def soft_kl(student, expert, temperature_student, temperature_expert, kind="forw
     log_s = log_softmax(student / temperature_student)
     log_e = log_softmax(expert / temperature_expert)
     p_s, p_e = np.exp(log_s), np.exp(log_e)
-    if kind == "forward":   # sum p_e (log p_e - log p_s); d log p_s,j / d x_k = [j=k] - p_s,k
+    if kind == "forward":   # with x = student / T_s: d log p_s,j / d x_k = [j=k] - p_s,k
         kl = (p_e * (log_e - log_s)).sum(-1)
         return kl, (p_s - p_e) / temperature_student
     gap = log_s - log_e     # sum p_s (log p_s - log p_e)
@@ -593,7 +593,7 @@ def soft_kl(student, expert, temperature_student, temperature_expert, kind="forw
 
 
 def distill_loss(student, features, actions, targets, config, grads=None, divergence=soft_kl):
-    """The loss in line 6 of Algorithm 1 and, into the dict `grads`, its gradients.
+    """The loss in line 6 of Algorithm 1, of Q twice, and, into the dict `grads`, its gradients.
 
         mean over B of sum_h lambda^h [c_R D(R_h) + c_Q (D(Q1_h) + D(Q2_h))]
 

@@ -197,7 +197,7 @@ class MSEDistiller(fac.Distiller):
 
 
 def consistency_loss(student, features, actions, targets, config, grads=None):
-    """Equation 4 and, with weight 2 (Table 2's for experts), TD-MPC's consistency.
+    """Equation 4 and, with weight 2 (TD-MPC's; Table 2 has 0), TD-MPC's consistency.
 
     That is the mean of |s_{h+1} - f_E(g_{h+1})|^2 over features, with the student's encoding,
     held fixed, of the last of `targets`: what the student reads of the expert's own rollout."""
