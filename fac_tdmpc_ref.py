@@ -194,8 +194,8 @@ class DistillConfig(Settings):
     grad_clip: float = field(10.0, "largest gradient norm (Table 2)", above=0)
     sizes: str = field("table2", "agent sizes: table2 (m = 50) or section51 (m = 512 // N)",
                        choices=("table2", "section51"))
-    own_episodes: int = field(7, "episodes that the student plays after each of the first seven "
-                              "eighths of the steps, to learn from [D8]", paper=0, least=0)
+    own_episodes: int = field(16, "episodes that the student plays after each of the first three "
+                              "quarters of the steps, to learn from [D8]", paper=0, least=0)
     own_share: float = field(0.25, "share of states from these [D8]", paper=0.0, least=0, most=1)
     held_out: float = field(0.05, "share of episodes held out, for rank correlations",
                             least=1e-4, most=0.5)
@@ -746,9 +746,9 @@ class Distiller:
         own and returns what `add` takes; not needed without own episodes [D8]."""
         need(play or not self.config.own_episodes, "pass `play`, or configure own_episodes=0")
         while self.t < self.config.steps:
-            played, eighth = len(self.own), 8 * self.t // self.config.steps
-            if eighth * self.config.own_episodes > played:
-                self.add(*play(played, eighth * self.config.own_episodes - played))
+            played, quarter = len(self.own), 4 * self.t // self.config.steps
+            if quarter * self.config.own_episodes > played:
+                self.add(*play(played, quarter * self.config.own_episodes - played))
             yield self.step()
 
     @property

@@ -179,16 +179,17 @@ class ReplayBuffer:
 
     def write(self, path, header, episodes=0):
         """A file for `Replay` with the newest `episodes` (0: all that are held), oldest first; an
-        episode's last row has no action."""
+        episode's last row has no action. header names the task, for `spread_targets`."""
         held = np.arange(self.count - len(self), self.count) % len(self.reward)
         order = held[-episodes:]
         action = np.zeros((len(order), fac.EPISODE_STEPS + 1, self.action.shape[2]), np.float16)
         action[:, :-1] = self.action[order]
         continues = np.ones(action.shape[:2], bool)
         continues[:, -1] = False
+        observation = self.observation[order].reshape(-1, self.observation.shape[2])
+        spread_targets(header["task"], observation, fac.stream(0, "replay targets"))
         fac.write_npz(path, {"kind": "replay", **header}, {
-            "observation": self.observation[order].reshape(-1, self.observation.shape[2])
-            .astype(np.float16),
+            "observation": observation.astype(np.float16),
             "action": action.reshape(-1, action.shape[2]), "continues": continues.ravel()},
             compress=True)
 
@@ -267,6 +268,17 @@ def hindsight(task, buffer, where, obs, reward, rng):
     moved, fresh = rng.random((2, len(start))) < [[3 / 4], [1 / 3]]
     back = np.where(fresh, obs[0, 3:5] - draw_targets(obs[0], rng), later.T).T
     move_target(obs.swapaxes(1, 2), reward, back.astype(np.float32), moved, task)
+
+
+def spread_targets(task, observation, rng):
+    """Give half of the states (M, O) of reacher's replay a target drawn anew, in place [D6].
+
+    Else a student would see one target an episode. The expert saw more by `hindsight`, from which
+    this differs: a student reads a sequence's first state, and the actions that followed.
+    """
+    if task.startswith("reacher"):
+        moved = rng.random(len(observation)) < 0.5
+        observation[moved, 3:5] = draw_targets(observation[moved].T.astype(np.float32), rng).T
 
 
 class Training:

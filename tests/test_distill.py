@@ -130,9 +130,9 @@ def test_a_share_of_the_states_is_the_students_own(replay):
     with fresh(replay, fac.dataclasses.replace(config, own_episodes=2)) as distiller:
         with pytest.raises(fac.UserError, match="own_episodes=0"):
             next(distiller.run())
-    for eighths, expected in ((0, 0), (1, 2), (2, 4), (7, 14)):
-        with fresh(replay, fac.dataclasses.replace(config, own_episodes=2, steps=80)) as distiller:
-            distiller.optimizer.t = 10 * eighths
+    for quarters, expected in ((0, 0), (1, 2), (2, 4), (3, 6)):
+        with fresh(replay, fac.dataclasses.replace(config, own_episodes=2)) as distiller:
+            distiller.optimizer.t = quarters * 75
             asked = []
             run = distiller.run(lambda first, count, asked=asked: asked.append((first, count))
                                 or own_episodes(*range(count)))

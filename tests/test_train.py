@@ -55,6 +55,24 @@ def test_the_buffer_drops_the_oldest_and_writes_a_replay(tmp_path, dtype):
     assert set(fac.Replay(tmp_path / "replay.npz").observation[:, 0]) == {3}  # the newest
 
 
+def test_half_of_a_reacher_replay_s_states_get_another_target():
+    rng = np.random.default_rng(0)
+    before = rng.standard_normal((4000, 8)).astype(np.float16)
+    for task, share in (("walker-walk", 0), ("reacher-hard", 0.5)):
+        after = before.copy()
+        train_expert.spread_targets(task, after, rng)
+        moved = (after[:, 3:5] != before[:, 3:5]).all(1)
+        assert abs(moved.mean() - share) < 0.03
+        assert np.array_equal(after[~moved], before[~moved])
+        assert np.array_equal(np.delete(after, [3, 4], 1), np.delete(before, [3, 4], 1))
+    seen = after[moved].astype(np.float32)
+    heading = np.cumsum(seen[:, :3], 1)
+    target = seen[:, 3:5] + 0.09 * np.stack([np.cos(heading).sum(1), np.sin(heading).sum(1)], 1)
+    distance = np.linalg.norm(target, axis=1)
+    assert 0.049 < distance.min() < 0.06 and 0.19 < distance.max() < 0.201
+    assert abs(np.corrcoef(target.T)[0, 1]) < 0.1  # x and y are two coordinates
+
+
 def test_segments_are_in_order_and_most_get_other_targets():
     rng = np.random.default_rng(1)
     buffer = train_expert.ReplayBuffer(8, 3, fac.EPISODE_STEPS)
