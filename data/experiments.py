@@ -42,8 +42,8 @@ ROW = (*KEY, "step", "return_mean", "return_std", "return_min", "expert_mean", "
 
 
 def make_run(task, seed, case, **settings):
-    """A run as its rows begin: settings, of which None means not set, as JSON. A run is known by
-    what is set: after a change of the defaults its CSV is of no use."""
+    """A run as its rows begin: settings, of which None means not set, as JSON. It is known by what
+    is set and, in `data`, by what it is made from."""
     settings = {k: v for k, v in settings.items() if v is not None}
     return {"task": task, "seed": str(seed), "case": case,
             "settings": json.dumps(settings, sort_keys=True)}
@@ -232,7 +232,6 @@ class ConsistentDistiller(fac.Distiller):
         """As Distiller's; the targets are followed by the expert's latents (L, B, K, F)."""
         features, actions, targets = super().draw(number, part, size)
         steps, _, *columns = actions.shape
-        fac.need(self.student.config.expert_latent_dim, "consistency needs encoder_input latent")
         x, end = fac.unroll(self.expert, features, actions, steps)
         after = np.concatenate([x[:, :features.shape[1], np.prod(columns):], end], 2)[0]
         return features, actions, [*targets, after.T.reshape(steps, *columns, -1)]
@@ -259,7 +258,8 @@ def distil(task, seed, case, settings):
     """Distil a student; a row at each evaluation. settings: of DistillConfig, and `num_agents`,
     `evaluations` on the way, of so many `episodes`, planned with `samples` and `iterations`;
     `data`: checksums, which tell apart what it is learned from."""
-    settings.pop("data", None)
+    data = settings.pop("data", None)
+    fac.need(data in (None, data_checksums(task)), f"data/{task} or a default has changed since")
     own = {k: settings.pop(k, v) for k, v in (("num_agents", None), ("evaluations", 1),
                                               ("episodes", 10))}
     about = {k: settings.pop(k) for k in ("samples", "iterations") if k in settings}
@@ -318,9 +318,10 @@ def distil_runs(args, cases):
 
 
 def data_checksums(task):
-    """Of a task's expert and replay, as a student's file names them."""
+    """Of a task's expert and replay, as a student's file names them; of the defaults."""
     expert, _ = fac.load_model(fac.data_file(task, "expert.npz"))
-    return fac.data_checksums(expert, fac.Replay(fac.data_file(task, "replay.npz")))
+    return [*fac.data_checksums(expert, fac.Replay(fac.data_file(task, "replay.npz"))),
+            fac.zlib.crc32(repr((fac.DistillConfig(), fac.PlannerConfig())).encode())]
 
 
 def command_figure4(args):
@@ -753,7 +754,8 @@ REPORT_HEAD = """# The paper's figures, here
 Written by `python data/experiments.py report` from the CSVs beside it; README.md says what they
 show. Returns: mean ± deviation over seeds (their number; one without), then the rank correlation of
 G; every run's settings are in its CSV. '10% TD-MPC' has hidden layers of 66 (B.2), which with
-Table 2's latents of 50 is 3% of the weights behind the encoder; six agents have 26%.
+Table 2's latents of 50 is 3% of the weights behind the encoder; six agents have 26%. One agent has
+layers of 512, quadruped-walk's expert of 256. Figure 13: latents of 50 an agent, so 50 N in all.
 
 """
 REPORTS = {"figure4": report_curves, "figure5": report_curves, "figure7": report_figure7,

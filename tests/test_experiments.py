@@ -453,6 +453,18 @@ def test_figures_7_and_8_plan_with_both_models(tmp_path, monkeypatch):
     assert len(seen) == 2 * (1 + 3 * 3)
 
 
+def test_a_run_made_with_other_defaults_is_another_run(monkeypatch):
+    seen, flags = [], ["--tasks", "reacher-hard", "--seeds", "0", "--set", "lam=0.5"]
+    monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: seen.extend(runs))
+    changed = fac.PlannerConfig(samples=7)
+    for default in (fac.PlannerConfig, fac.PlannerConfig, lambda: changed):
+        monkeypatch.setattr(fac, "PlannerConfig", default)
+        assert experiments.main(["sweep", *flags]) == 0
+    assert seen[0] == seen[1] != seen[2]
+    with pytest.raises(fac.UserError, match="data/reacher-hard or a default has changed since"):
+        next(experiments.distil("reacher-hard", 0, "sweep", json.loads(seen[0]["settings"])))
+
+
 def test_departures_are_those_that_the_settings_name(monkeypatch):
     seen = []
     monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: seen.extend(runs))
