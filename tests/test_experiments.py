@@ -456,9 +456,10 @@ def test_figures_7_and_8_plan_with_both_models(tmp_path, monkeypatch):
 def test_a_run_made_with_other_defaults_is_another_run(monkeypatch):
     seen, flags = [], ["--tasks", "reacher-hard", "--seeds", "0", "--set", "lam=0.5"]
     monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: seen.extend(runs))
-    changed = fac.PlannerConfig(samples=7)
-    for default in (fac.PlannerConfig, fac.PlannerConfig, lambda: changed):
-        monkeypatch.setattr(fac, "PlannerConfig", default)
+    changed = dataclasses.make_dataclass("PlannerConfig", [(
+        "samples", int, fac.field(7, "another default"))], bases=(fac.PlannerConfig,), frozen=True)
+    for config_class in (fac.PlannerConfig, fac.PlannerConfig, changed):
+        monkeypatch.setattr(fac, "PlannerConfig", config_class)
         assert experiments.main(["sweep", *flags]) == 0
     assert seen[0] == seen[1] != seen[2]
     with pytest.raises(fac.UserError, match="data/reacher-hard or a default has changed since"):
