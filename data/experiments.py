@@ -403,8 +403,8 @@ def planning_runs(args, variants):
     runs = []
     for task, (case, seed) in itertools.product(
             args.tasks, [("expert", 0), *(("student", seed) for seed in args.seeds)]):
-        model, _ = load(task, seed, case, args.students)
-        weights = fac.checksum(model.params.values())
+        model, header = load(task, seed, case, args.students)
+        weights = fac.record_key(model, planning_for(header, {}), 0)  # and the planner
         runs += [make_run(task, seed, case, episodes=args.episodes, weights=weights, **variant)
                  for variant in variants(task)]
     return runs
@@ -809,7 +809,7 @@ def make_parser():
                          help="runs at a time, of --backend loky [one for each core]")
         sub.add_argument("--out", help=f"the CSV [data/results/{name}.csv]")
         sub.add_argument("--episodes", type=positive, default=defaults.get("episodes", 10),
-                         help="evaluation episodes of a run [%(default)s]")
+                         help="of each evaluation [%(default)s]")
         if "steps" in defaults:
             sub.add_argument("--steps", type=positive, default=defaults["steps"],
                              help="gradient steps [%(default)s; paper: 100000]")
@@ -826,8 +826,8 @@ def make_parser():
              "and the small one of B.2, and TAP, by Algorithm 1; return against steps.", shipped,
              steps=steps, evaluations=4)
     add_runs("figure5", command_figure5, "Section 5.3: KL against MSE, the perturbations' "
-             "deviation, the student's temperature, a consistency loss.", walkers, steps=steps,
-             evaluations=4)
+             "deviation (clipped), the student's temperature, a consistency loss.", walkers,
+             steps=steps, evaluations=4)
     add_runs("departures", command_departures, "The differences in distillation one at a time, "
              "towards the paper's values.", ["reacher-hard", "walker-walk"], steps=steps,
              evaluations=1)

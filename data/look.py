@@ -192,6 +192,8 @@ def command_figure9(args):
     """figure9: latents by joint, and what each joint contributes in the best and worst episode."""
     model, header, task = open_model(args)
     plt, began = pyplot_for(args.out), time.time()
+    with fac.optional("scikit-learn", "experiments"):
+        import sklearn  # noqa: F401  (missed before the episodes are played)
     config = fac.PlannerConfig(**fac.made_for(header, args.model))
     seeds = fac.episode_seeds(args.seed, args.episodes)
     obs, actions, rewards, _ = fac.play(model, task, config, seeds)

@@ -223,7 +223,8 @@ def print_benchmark(result, robots):
     columns = [(m, "one-thread") for m in ("TD-MPC", "10% TD-MPC", "TAP", "Fac-TDMPC")]
     columns += [("Fac-TDMPC", mode) for mode in MODES[1:]]
     print(f"\nPrediction, ms, batch {TABLE3_BATCH}, mean ± sd; x: TD-MPC's time over Fac-TDMPC's, "
-          f"one thread / processes / one agent alone (paper: N threads)\n")
+          f"one thread / processes / one agent alone (paper: N threads); TAP: TD-MPC's networks on "
+          f"two latent actions\n")
     heads = [m if mode == "one-thread" else mode for m, mode in columns]
     fac.print_table([("", "", *heads, "x", "paper's x")] + [
         (robot, f, *(times[(robot, f, *column)] for column in columns),
