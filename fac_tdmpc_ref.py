@@ -58,6 +58,7 @@ from pathlib import Path
 import numpy as np
 
 F32 = np.float32
+DATA = Path(__file__).resolve().parent / "data"
 
 
 class UserError(Exception):
@@ -406,7 +407,6 @@ def one_thread():
 
 
 # ==== 3. World model (sections 3.2 and 4.2) ===========================================
-
 
 class WorldModel:
     """f_E, f_T, f_R, f_Q with an agent axis: TD-MPC for N = 1, Fac-TDMPC for N = A.
@@ -811,7 +811,6 @@ def rank_correlation(distiller, states, discount=0.99):
 
 # ==== 5. Planning: MPPI (Equations 2 and 3), then the worker processes ================
 
-
 def h_step_return(model, z, actions, config):
     """Equation 2 for every agent as it reads; `Returns` computes the same faster.
 
@@ -881,11 +880,14 @@ def policy_noise(shape, rng):
 
 
 class AgentPlanner:
-    """Plans for the agents of one model: the same for all of them, for a part, for N = 1."""
+    """Plans for the agents of one model: the same for all of them, for a part, for N = 1.
 
-    def __init__(self, model, config):
+    rows, swap: for `SharedReturns`, where an agent is another process's, too."""
+
+    def __init__(self, model, config, rows=None, swap=None):
         self.model, self.config = model, config
-        self.returns = Returns(model) if config.returns == "fast" else None
+        self.returns = (None if config.returns == "plain" else
+                        SharedReturns(model, rows, swap) if rows else Returns(model))
         self.reset([])
 
     def reset(self, seeds):
@@ -925,19 +927,21 @@ class Planner(contextlib.AbstractContextManager):
     has died. Some weights are copied: make a new one when they have changed."""
 
     def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
-        self.model, self._parts = model, split_agents(model.config.num_agents, workers)
-        self.own = AgentPlanner(model.agents(0, self._parts[0].stop), config)
+        self.model, sizes = model, model.config
+        blocks = 1 if config.returns == "plain" else sample_blocks(sizes, config.samples)
+        self._parts, rows = split_agents(sizes.num_agents, workers, blocks)
+        own, *others = ((model.agents(part.start, part.stop), config, row)
+                        for part, row in zip(self._parts, rows))
+        self.own = AgentPlanner(*own, self._add_up)
         self._workers = Workers(_planning_worker, workers, "planning worker")
-        for i, part in enumerate(self._parts[1:]):
-            self._workers.send(i, (model.agents(part.start, part.stop), config))
+        self._workers.send_all(others)
         self.reset(np.random.SeedSequence(seed).entropy)  # None: the system's own
 
     def reset(self, seed=None):
         """Start an episode: forget the warm start; a seed also starts the random streams anew."""
         n = self.model.config.num_agents
         seeds = [] if seed is None else np.random.SeedSequence(seed).spawn(n)
-        for i, part in enumerate(self._parts[1:]):
-            self._workers.send(i, seeds[part])
+        self._workers.send_all(seeds[part] for part in self._parts[1:])
         self.own.reset(seeds[self._parts[0]])
 
     def act(self, obs):
@@ -949,13 +953,23 @@ class Planner(contextlib.AbstractContextManager):
         with one_thread():
             z = self.model.encode(obs[:, None])
             try:
-                for i, part in enumerate(self._parts[1:]):
-                    self._workers.send(i, z[part])
-                own = self.own.plan(z[self._parts[0]])
-                return np.concatenate([own, *self._workers.receive_all()]).reshape(-1)
+                self._workers.send_all(z[part] for part in self._parts[1:])
+                plans = [self.own.plan(z[self._parts[0]]), *self._workers.receive_all()]
             except BaseException:  # answers left unread would be the next decision's
                 self.close()
                 raise
+        action = np.empty((len(z), self.model.config.agent_actions), F32)
+        for part, plan in zip(self._parts, plans):  # both who share an agent plan it alike
+            action[part] = plan
+        return action.reshape(-1)
+
+    def _add_up(self, G):
+        """Returns of this process's agents, of which every process has found its samples'."""
+        total = np.zeros((self.model.config.num_agents, G.shape[1]), F32)
+        for part, found in zip(self._parts, [G, *self._workers.receive_all()]):
+            total[part] += found
+        self._workers.send_all(total[part] for part in self._parts[1:])
+        return total[self._parts[0]]
 
     def close(self):
         """End the worker processes."""
@@ -999,8 +1013,6 @@ class Returns:
             homogeneous(p, f"{name}.{i}")[:, :-1].copy()
             for name, i in (*((name, 4) for name in step), *((name, 5) for name in both_q)))
         self.to_q = np.concatenate(to_q, 2) / 2                         # (N, 1, 2w + 2)
-        # samples in a block: OpenBLAS is fastest on small matrices when the block fits the cache
-        self.block = 256 if model.config.mlp_dim >= 256 else 128
 
     def _fold_norm(self, p):
         """First layers of both Q, after which LayerNorm is y / sqrt(spread @ y^2 + eps) + shift.
@@ -1032,11 +1044,11 @@ class Returns:
 
     def __call__(self, actions):
         """actions (N, L, d, S) -> G (N, S)."""
-        blocks = max(1, round(actions.shape[-1] / self.block))
-        return np.concatenate([self._block(part) for part in
+        blocks = sample_blocks(self.sizes, actions.shape[-1])
+        return np.concatenate([self.block(part) for part in
                                np.array_split(actions, blocks, axis=-1)], 1)
 
-    def _block(self, actions):
+    def block(self, actions):
         """Equation 2 for a block of samples."""
         m, half, G = self.sizes.latent_dim, self.sizes.mlp_dim + 1, F32(0)
         x = np.ones((len(actions), m + actions.shape[2] + 1, actions.shape[-1]), F32)  # (z, a, 1)
@@ -1069,15 +1081,51 @@ class Returns:
         return np.tanh(y, out=y).reshape(shape)
 
 
+def sample_blocks(sizes, samples):
+    """Blocks of samples: OpenBLAS is fastest on small matrices when a block fits the cache."""
+    return max(1, round(samples / (256 if sizes.mlp_dim >= 256 else 128)))
+
+
 # ---- The same, in processes: workers plan for a part of the agents each.
 
 
-def split_agents(agents, workers):
-    """Agents of this process and of each worker beside it, as slices; UserError for too many."""
+def split_agents(agents, workers, blocks=1):
+    """Agents of this process and of each worker beside it, as slices; UserError for too many.
+
+    Where agents don't divide evenly, neighbours share one and its `blocks` of samples: then also,
+    for each process, a slice of its agents for each block, those that it rolls out (else None)."""
     need(0 <= workers < agents, f"{workers} workers are no use to {agents} agents, one of which is "
          f"left to this process; pass 0 to {agents - 1}")
-    cuts = np.linspace(0, agents, workers + 2).round().astype(int)
-    return [slice(i, j) for i, j in zip(cuts, cuts[1:])]
+    cuts = np.linspace(0, agents * blocks, workers + 2).round().astype(int)
+    parts = [slice(i // blocks, -(-j // blocks)) for i, j in zip(cuts, cuts[1:])]
+    if not (cuts % blocks).any():
+        return parts, [None] * len(parts)
+    first = -((np.arange(blocks) - cuts[:, None]) // blocks)  # agent from each cut on, by block
+    return parts, [[slice(i, j) for i, j in zip(begin - part.start, end - part.start)]
+                   for part, begin, end in zip(parts, first, first[1:])]
+
+
+class SharedReturns:
+    """`Returns` where another process plans the first agent, too, or the last. Both draw the same
+    actions; of block k each rolls out the agents rows[k]; `swap` adds up what they found."""
+
+    def __init__(self, model, rows, swap):
+        self.rows, self.swap = rows, swap
+        self.parts = [Returns(model.agents(part.start, part.stop)) for part in rows]
+
+    def start(self, z, config):
+        """As that of `Returns`."""
+        for rows, part in zip(self.rows, self.parts):
+            part.start(z[rows], config)
+        return self
+
+    def __call__(self, actions):
+        """actions (N, L, d, S) -> G (N, S)."""
+        G = np.zeros((len(actions), actions.shape[-1]), F32)
+        blocks = (np.array_split(x, len(self.rows), axis=-1) for x in (actions, G))
+        for rows, part, block, into in zip(self.rows, self.parts, *blocks):
+            into[rows] = part.block(block[rows])
+        return self.swap(G)
 
 
 def cores():
@@ -1091,8 +1139,9 @@ def useful_workers(agents):
 
 
 def _planning_worker(connection):
-    """Plans for its part of the agents: latents in, actions out; a list is `reset`'s seeds."""
-    planner = AgentPlanner(*connection.recv())
+    """Plans for its part of the agents: latents in, actions out; a list is `reset`'s seeds. Within
+    a plan, returns of agents that are shared go out and come back added up."""
+    planner = AgentPlanner(*connection.recv(), lambda G: connection.send(G) or connection.recv())
     while True:
         message = connection.recv()
         if isinstance(message, list):
@@ -1135,6 +1184,11 @@ class Workers(contextlib.AbstractContextManager):
         except (BrokenPipeError, ConnectionResetError):
             while True:  # past answers left unread, to what it ended with
                 self.receive(i)
+
+    def send_all(self, messages):
+        """Send one of the messages to each worker, in their order."""
+        for i, message in zip(range(len(self._members)), messages):
+            self.send(i, message)
 
     def receive(self, i):
         """The next message of worker i; WorkerError as soon as it has died."""
@@ -1181,47 +1235,12 @@ def _run_worker(target, connection):
 TASKS = {
     "reacher-easy": ("reacher", "easy", 8, 3), "reacher-hard": ("reacher", "hard", 8, 3),
     "hopper-hop": ("hopper", "hop", 15, 4), "fish-swim": ("fish", "swim", 24, 5),
-    "cheetah-run": ("cheetah", "run", 17, 6),
-    "walker-walk": ("walker", "walk", 24, 6), "walker-run": ("walker", "run", 24, 6),
+    "cheetah-run": ("cheetah", "run", 17, 6), "walker-walk": ("walker", "walk", 24, 6),
+    "walker-run": ("walker", "run", 24, 6),
     "quadruped-walk": ("quadruped", "walk", 78, 12), "quadruped-run": ("quadruped", "run", 78, 12),
     "humanoid-stand": ("humanoid", "stand", 67, 21), "humanoid-walk": ("humanoid", "walk", 67, 21)}
 REACHER_TARGET = {"easy": 0.05, "hard": 0.015}  # radius of the target, metres
-FINGER_RADIUS, REACHER_LINK = 0.01, 0.09
-
-# dm_control's reacher has two links; the paper's has three. Three links of 9 cm, the second and
-# third joint stop at 80 degrees, nothing collides, the task is the two-link one's.
-REACHER_XML = f"""
-<mujoco model="three-link planar reacher">
-  <compiler angle="degree"/>
-  <option timestep="0.02"><flag contact="disable"/></option>
-  <default>
-    <joint type="hinge" axis="0 0 1" damping="0.01"/>
-    <motor gear="0.05" ctrlrange="-1 1" ctrllimited="true"/>
-    <default class="link">
-      <geom type="capsule" size="0.01" rgba="0.7 0.5 0.3 1" fromto="0 0 0 {REACHER_LINK} 0 0"/>
-    </default>
-  </default>
-  <worldbody>
-    <light pos="0 0 1"/> <camera name="fixed" pos="0 0 0.75"/>
-    <geom name="ground" type="plane" size="0.3 0.3 10" rgba="0.2 0.3 0.4 1"/>
-    <geom name="target" type="sphere" pos="0 0 0.01" size="0.05" rgba="0.8 0.2 0.2 1"/>
-    <body name="arm0" pos="0 0 0.01">
-      <joint name="joint0"/> <geom name="arm0" class="link"/>
-      <body name="arm1" pos="{REACHER_LINK} 0 0">
-        <joint name="joint1" range="-80 80"/> <geom name="arm1" class="link"/>
-        <body name="hand" pos="{REACHER_LINK} 0 0">
-          <joint name="joint2" range="-80 80"/>
-          <geom name="hand" class="link" fromto="0 0 0 0.1 0 0"/>
-          <body name="finger" pos="{REACHER_LINK} 0 0">
-            <geom name="finger" type="sphere" size="{FINGER_RADIUS}" rgba="0.9 0.6 0.2 1"/>
-          </body>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <actuator> <motor joint="joint0"/> <motor joint="joint1"/> <motor joint="joint2"/> </actuator>
-</mujoco>
-"""
+REACHER = DATA / "reacher.xml"  # three links; dm_control's has two
 
 
 class Environment:
@@ -1244,8 +1263,9 @@ class Environment:
                 f"dm-control==1.0.50, and MUJOCO_GL unset or one of egl, osmesa, disable "
                 f"(it is {os.environ['MUJOCO_GL']!r})") from error
         if domain == "reacher":
+            need(REACHER.exists(), f"{REACHER}: no such file; run from a clone of the repository")
             self.env = control.Environment(
-                reacher.Physics.from_xml_string(REACHER_XML),
+                reacher.Physics.from_xml_path(str(REACHER)),
                 reacher.Reacher(REACHER_TARGET[name], random=0), time_limit=20)
         else:
             self.env = suite.load(domain, name, task_kwargs={"random": 0})
@@ -1292,7 +1312,6 @@ def training_seeds(seed, use, first, count):
 
 # ==== 7. Files: weights, replay, records ==============================================
 
-DATA = Path(__file__).resolve().parent / "data"
 FORMAT = "fac-tdmpc-ref 1"
 
 
@@ -1459,7 +1478,6 @@ def data_file(task, name):
 
 # ==== 8. Commands =====================================================================
 
-
 def decisions(model, task, config, seeds, environment=None):
     """Plan through the episode of each seed; yields every decision's observation (O,), action
     (A,), reward and seconds of planning. environment: to use instead of the task's own."""
@@ -1497,8 +1515,7 @@ def play(model, task, config, seeds, workers=None, label="playing"):
     here, done = decisions(model, task, config, seeds), [0] * len(parts)
     with progress(label, E * T, "decision") as bar, \
             Workers(_playing_worker, workers, "evaluation worker") as pool:
-        for w in range(workers):
-            pool.send(w, (model, task, config, [seeds[i] for i in parts[w]]))
+        pool.send_all((model, task, config, [seeds[i] for i in part]) for part in parts)
         while sum(done) < E * T:  # a disabled bar doesn't count
             for w, part in enumerate(parts):
                 if done[w] < len(part) * T:

@@ -5,6 +5,7 @@
 import contextlib
 import dataclasses
 import functools
+import itertools
 import pickle
 import sys
 from pathlib import Path
@@ -37,19 +38,16 @@ class Predictor:
     """
 
     def __init__(self, model, workers=0):
-        mine, *theirs = fac.split_agents(model.config.num_agents, workers)
+        (mine, *theirs), _ = fac.split_agents(model.config.num_agents, workers)
         self.model = model.agents(mine.start, mine.stop)
         sizes = self.model.config
         self._x = np.random.default_rng(0).standard_normal(
             (sizes.num_agents, sizes.latent_dim + sizes.agent_actions, TABLE3_BATCH), fac.F32)
         self._workers = fac.Workers(_prediction_worker, workers, "prediction worker")
-        self._count = workers
-        for i, share in enumerate(theirs):
-            self._workers.send(i, model.agents(share.start, share.stop))
+        self._workers.send_all(model.agents(share.start, share.stop) for share in theirs)
 
     def __call__(self, function):
-        for i in range(self._count):
-            self._workers.send(i, function)
+        self._workers.send_all(itertools.repeat(function))
         kinds = fac.QNET if function == "f_Q" else fac.MLP
         for name in FUNCTIONS[function]:
             fac.forward(kinds, self.model.params, name, self._x)
@@ -138,7 +136,7 @@ def benchmark_decisions(robot, workers, planning, rounds):
             [gemm, *(functools.partial(subject[-1], obs) for subject in subjects)], rounds,
             f"{robot}: decisions")
         echo = stack.enter_context(fac.Workers(_echo_worker, workers, "echo worker"))
-        hand_over = fac.interleaved_seconds([functools.partial(wake, echo, workers)], 200,
+        hand_over = fac.interleaved_seconds([functools.partial(wake, echo)], 200,
                                             f"{robot}: hand-over")
     multiply_add = float(np.median(seconds[:, 0])) / 512 ** 3
     rows = []
@@ -151,10 +149,9 @@ def benchmark_decisions(robot, workers, planning, rounds):
     return rows, 1e6 * float(np.median(hand_over)) if workers else None
 
 
-def wake(workers, count):
+def wake(workers):
     """Wake all workers and wait for their answers, without planning: what a plan pays."""
-    for i in range(count):
-        workers.send(i, None)
+    workers.send_all(itertools.repeat(None))
     workers.receive_all()
 
 

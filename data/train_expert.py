@@ -33,6 +33,7 @@ TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
 NOT_ONLINE = ("steps", "batch_size", "reuse", "own_episodes", "own_share", "held_out")
 FOLLOWING_DEFAULTS = {"noise_samples": 3}
 TORCH_ONLY = {"device": None, "precision": "float32", "threads": 1}  # and their defaults
+FINGER_RADIUS, REACHER_LINK = 0.01, 0.09  # of data/reacher.xml, metres
 LOSSES = ("consistency", "reward", "value", "kl_reward", "kl_value")
 CURVE = ("decisions", "updates", "seconds", "exploration_std", "horizon", "return_mean",
          "return_min", "return_max", *LOSSES, "eval_expert", "eval_student")
@@ -103,21 +104,16 @@ class Actors:
     def __init__(self, task, workers):
         fac.lookup_task(task)
         self._workers, self._count = fac.Workers(_acting_worker, workers, "acting worker"), workers
-        self._send_all(task)
+        self._workers.send_all([task] * workers)
 
     def begin(self, episodes):
         """Start episodes: (seed, player, exploration_std) of each."""
         self._begun = len(episodes)
-        for i in range(self._count):
-            self._workers.send(i, ("begin", episodes[i::self._count]))
+        self._workers.send_all(("begin", episodes[i::self._count]) for i in range(self._count))
 
     def play(self, decisions, planners):
         """Let all go on, players with newer planners {player: (model, planner config)}."""
-        self._send_all(("play", decisions, planners))
-
-    def _send_all(self, message):
-        for i in range(self._count):
-            self._workers.send(i, message)
+        self._workers.send_all([("play", decisions, planners)] * self._count)
 
     def wait(self):
         """Until they have; (observations, actions, rewards) of every episode so far."""
@@ -240,7 +236,7 @@ def move_target(obs, reward, back, chosen, task):
     step's finger-to-target puts it where the finger is then. obs (H+1, B, 8), reward (H, B): the
     new one is that of the decision's end for all its repeated actions.
     """
-    radius = fac.REACHER_TARGET[fac.lookup_task(task)[1]] + fac.FINGER_RADIUS
+    radius = fac.REACHER_TARGET[fac.lookup_task(task)[1]] + FINGER_RADIUS
     obs[:, chosen, 3:5] -= back[chosen]
     distance = np.linalg.norm(obs[1:, chosen, 3:5], axis=-1)
     reward[:, chosen] = fac.ACTION_REPEAT * (distance <= radius)
@@ -249,7 +245,7 @@ def move_target(obs, reward, back, chosen, task):
 def draw_targets(obs, rng):
     """Finger-to-target (2, B) of reacher states (8, B) for targets drawn as the task draws them."""
     heading = np.cumsum(obs[:3], 0)
-    finger = fac.REACHER_LINK * np.stack([np.cos(heading).sum(0), np.sin(heading).sum(0)])
+    finger = REACHER_LINK * np.stack([np.cos(heading).sum(0), np.sin(heading).sum(0)])
     angle, radius = rng.uniform(0, 2 * np.pi, obs.shape[1]), rng.uniform(0.05, 0.2, obs.shape[1])
     return radius * np.stack([np.cos(angle), np.sin(angle)]) - finger
 

@@ -94,7 +94,7 @@ def test_segments_are_in_order_and_most_get_other_targets():
     # hindsight moves the target by a later finger-to-target of the episode, fresh ones are near 0
     back = walk[starts, 3] - obs[0, 3]
     hindsight = np.isclose(back[:, None], walk[:, 3], atol=1e-4).any(1)
-    finger = fac.REACHER_LINK * np.cos(np.cumsum(obs[0, :3], 0)).sum(0)
+    finger = train_expert.REACHER_LINK * np.cos(np.cumsum(obs[0, :3], 0)).sum(0)
     fresh = moved & (np.abs(finger + obs[0, 3]) <= 0.2 + 1e-4)
     assert 0.42 < (moved & hindsight).mean() < 0.58 and 0.17 < fresh.mean() < 0.33
     assert (hindsight | fresh)[moved].all()
