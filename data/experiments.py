@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The paper's tables and figures, each by one command.
 
-    python data/experiments.py table3 --figure data/figures/prediction.png   # and Figure 6
+    python data/experiments.py table3                   # figure6: the same, and its picture
     python data/experiments.py figure4 --tasks walker-run --seeds 0 1 2
     python data/experiments.py report
 
@@ -791,12 +791,12 @@ def make_parser():
     sub = fac.add_command(
         commands, "table3", command_table3, "Planning speed: Table 3 (the networks) and whole "
         "decisions, centralized and factored, in one process and in several.",
-        epilog="Fresh weights: as fast as learned ones. Keep the machine quiet, and read ratios.")
+        epilog="Weights are fresh. Keep the machine quiet, read ratios.", aliases=["figure6"])
     sub.add_argument("--robots", nargs="+", default=list(ROBOTS), choices=ROBOTS, metavar="ROBOT",
                      help="some of: " + ", ".join(ROBOTS) + " [all]")
     sub.add_argument("--workers", type=fac.natural, help="beside this process [as many as help]")
     sub.add_argument("--runs", type=ten, default=100, help="timings; of decisions a tenth [100]")
-    sub.add_argument("--figure", help="draw Figure 6 into this file")
+    sub.add_argument("--figure", help="draw it into this file [figure6: data/figures/figure6.png]")
     fac.add_config(sub, fac.PlannerConfig, **fac.paper_preset(fac.PlannerConfig))
     def add_runs(name, run, help, tasks, **defaults):
         sub = fac.add_command(commands, name, run, help, epilog="The same command again makes "

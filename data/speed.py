@@ -1,6 +1,6 @@
 """Table 3 and Figure 6: milliseconds of the networks and of whole decisions, fresh weights.
 
-`experiments.py table3` runs it. Speed doesn't depend on what a model has learned.
+`experiments.py table3` runs it, or `figure6`. Speed doesn't depend on what a model has learned.
 """
 import contextlib
 import dataclasses
@@ -191,6 +191,8 @@ def command_table3(args):
     """table3: the networks and whole decisions on this machine."""
     planning = fac.from_args(fac.PlannerConfig, args, **fac.paper_preset(fac.PlannerConfig))
     args.robots = list(dict.fromkeys(args.robots))
+    if args.command == "figure6":
+        args.figure = args.figure or fac.DATA / "figures" / "figure6.png"
     if args.figure:
         pyplot_for(args.figure)
     prediction, decision, hand_overs = [], [], []

@@ -45,9 +45,10 @@ def test_bad_commands_are_refused(tmp_path, flags, parts):
     refused(run(*flags, cwd=tmp_path), *parts)
 
 
-def test_table3_refuses_a_picture_it_cannot_draw(tmp_path):
+@pytest.mark.parametrize("command", [["table3", "--figure", "x.png"], ["figure6"]])
+def test_table3_refuses_a_picture_it_cannot_draw(tmp_path, command):
     (tmp_path / "matplotlib.py").write_text(BLOCKED)
-    refused(run("table3", "--figure", "x.png", cwd=tmp_path,
+    refused(run(*command, cwd=tmp_path,
                 env={"PYTHONPATH": str(tmp_path), **ONE_THREAD}), "matplotlib")
 
 
