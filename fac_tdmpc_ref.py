@@ -20,7 +20,8 @@ the case N = 1. There is one world model, one planner, one loss. The axes, every
     B   batch;   S   action sequences (the last axis)
     K   noise samples of the distillation loss (behind B): actions are (L, A, B, K) there
     H   horizon: H rewards, then Q;   L   actions of a sequence: H + 1 in Equations 2 and 4
-    F   features that an encoder reads;   P   proposals;   E   elites, or episodes;   T   decisions
+    F   features an encoder reads;   P   proposals;   E   elites, or episodes;   T   decisions
+    M   rows of a replay
 
 A layer is W (N, out, in), b (N, out, 1) and computes W @ x + b on x (N, in, B): samples last, so
 that activations run over long contiguous rows, and a torch Linear.weight goes in as weight[None].
@@ -200,6 +201,11 @@ class DistillConfig(Settings):
     own_share: float = field(0.25, "share of states from these [D8]", paper=0.0, least=0, most=1)
     held_out: float = field(0.05, "share of episodes held out, for rank correlations",
                             least=1e-4, most=0.5)
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.own_episodes and not self.own_share:
+            self.refuse("own_share", "above 0 where there are own_episodes")
 
 
 def stream(seed, use, index=0):
@@ -669,6 +675,7 @@ class Distiller:
         need((replay.dim_obs, replay.dim_action) == (theirs.dim_obs, theirs.dim_action),
              f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, {replay.dim_action}), the "
              f"expert expects ({theirs.dim_obs}, {theirs.dim_action}); pass its own task's replay")
+        need(not theirs.expert_latent_dim, "an expert has an encoder of its own; this is a student")
         self.expert, self.replay, self.config, self.seed = expert, replay, config, seed
         need(expert.has_policy or not config.own_episodes, "the expert has no policy, which says "
              "what to do in the student's own states; pass --own-episodes 0")
@@ -827,24 +834,24 @@ def h_step_return(model, z, actions, config):
     return G + gamma ** config.horizon * (q1 + q2) / 2
 
 
-def mppi(returns, mean, config, rngs, proposals=None):
+def mppi(rollout, mean, config, rngs, proposals=None):
     """MPPI: refine a Gaussian over action sequences by its elites, for each agent alone.
 
-    returns: (N, L, d, S) actions -> (N, S); mean (N, L, d): the first Gaussian's; rngs: one
-    Generator for each agent; proposals (N, L, d, P): sequences that compete in every iteration.
+    rollout: actions (N, L, d, S) -> returns (N, S); mean (N, L, d): the first Gaussian's; rngs:
+    one Generator for each agent; proposals (N, L, d, P): sequences that compete in every iteration.
     Elites are chosen agent by agent (Equation 3): G is a sum of G_i(a_i), so the best of each is
     the best of all (Proposition 1). N = 1 is centralized MPPI. Returns the new mean (N, L, d), the
     last elites (N, L, d, E) and their scores (N, E), which sum to 1."""
     mean, std = mean[..., None], F32(config.max_std)
     if proposals is not None:
-        G_proposals = returns(proposals)
+        G_proposals = rollout(proposals)
     for _ in range(config.iterations):
         actions = np.stack([rng.standard_normal((*mean.shape[1:3], config.samples), F32)
                             for rng in rngs])
         actions *= std
         actions += mean
         np.clip(actions, -1, 1, out=actions)
-        G = returns(actions)
+        G = rollout(actions)
         if proposals is not None:
             actions = np.concatenate([actions, proposals], -1)
             G = np.concatenate([G, G_proposals], 1)
@@ -882,12 +889,11 @@ def policy_noise(shape, rng):
 class AgentPlanner:
     """Plans for the agents of one model: the same for all of them, for a part, for N = 1.
 
-    rows, swap: for `SharedReturns`, where an agent is another process's, too."""
+    rows, swap: for `Returns`, where an agent is another process's, too."""
 
     def __init__(self, model, config, rows=None, swap=None):
         self.model, self.config = model, config
-        self.returns = (None if config.returns == "plain" else
-                        SharedReturns(model, rows, swap) if rows else Returns(model))
+        self.returns = None if config.returns == "plain" else Returns(model, rows, swap)
         self.reset([])
 
     def reset(self, seeds):
@@ -900,9 +906,9 @@ class AgentPlanner:
     def plan(self, z):
         """z (N, m, 1) -> the agents' first actions (N, d); keeps the warm start."""
         config = self.config
-        returns = (self.returns.start(z, config) if self.returns else
+        rollout = (self.returns.start(z, config) if self.returns else
                    functools.partial(h_step_return, self.model, z, config=config))
-        mean, elites, scores = mppi(returns, self.mean, config, self.rngs, self._proposals(z))
+        mean, elites, scores = mppi(rollout, self.mean, config, self.rngs, self._proposals(z))
         self.mean = np.concatenate([mean[:, 1:], np.zeros_like(mean[:, :1])], 1)
         return mean[:, 0] if config.output == "mean" else draw_elite(elites, scores, self.rngs)
 
@@ -915,7 +921,7 @@ class AgentPlanner:
         return policy_rollout(self.model, np.repeat(z, P, 2), noise).swapaxes(0, 1)
 
 
-class Planner(contextlib.AbstractContextManager):
+class Planner(contextlib.ExitStack):  # whose `close` ends the workers
     """Observation in, action out, with the warm start kept between decisions.
 
         with Planner(model, PlannerConfig(), seed=0, workers=1) as planner:
@@ -933,7 +939,8 @@ class Planner(contextlib.AbstractContextManager):
         own, *others = ((model.agents(part.start, part.stop), config, row)
                         for part, row in zip(self._parts, rows))
         self.own = AgentPlanner(*own, self._add_up)
-        self._workers = Workers(_planning_worker, workers, "planning worker")
+        super().__init__()
+        self._workers = self.enter_context(Workers(_planning_worker, workers, "planning worker"))
         self._workers.send_all(others)
         self.reset(np.random.SeedSequence(seed).entropy)  # None: the system's own
 
@@ -964,19 +971,13 @@ class Planner(contextlib.AbstractContextManager):
         return action.reshape(-1)
 
     def _add_up(self, G):
-        """Returns of this process's agents, of which every process has found its samples'."""
+        """Add up the returns (N, S) of all processes, zero where one rolled nothing out; each gets
+        those of its own agents back."""
         total = np.zeros((self.model.config.num_agents, G.shape[1]), F32)
         for part, found in zip(self._parts, [G, *self._workers.receive_all()]):
             total[part] += found
         self._workers.send_all(total[part] for part in self._parts[1:])
         return total[self._parts[0]]
-
-    def close(self):
-        """End the worker processes."""
-        self._workers.close()
-
-    def __exit__(self, *_):
-        self.close()
 
 
 # ---- The same, fast: a first reading skips this. `Returns` computes h_step_return.
@@ -1001,10 +1002,14 @@ class Returns:
     Layers are homogeneous matrices: a bias costs no pass over the activations, and the row of
     ones goes through ELU unchanged. Networks with the same input share its first product
     (dynamics with reward; both Q). The latent's part of that product is computed once a plan, as
-    all samples start from one latent. LayerNorm's mean and gain are folded into the weights."""
+    all samples start from one latent. LayerNorm's mean and gain are folded into the weights.
 
-    def __init__(self, model):
+    rows: where another process plans the first or last agent, too. Both draw the same actions; of
+    block k each rolls out the agents rows[k], a slice; `swap` adds up what they found."""
+
+    def __init__(self, model, rows=None, swap=None):
         self.sizes, p = model.config, model.params  # below, w is the hidden width
+        self.rows, self.swap = rows, swap
         step, both_q = ("_dynamics", "_reward"), ("_Q1", "_Q2")
         self.first = [side_by_side(p, step, 0), self._fold_norm(p)]     # (N, 2w + 2, m + d + 1)
         self.second = [[homogeneous(p, f"{name}.{i}") for name in pair]  # (N, w + 1, w + 1)
@@ -1044,40 +1049,43 @@ class Returns:
 
     def __call__(self, actions):
         """actions (N, L, d, S) -> G (N, S)."""
-        blocks = sample_blocks(self.sizes, actions.shape[-1])
-        return np.concatenate([self.block(part) for part in
-                               np.array_split(actions, blocks, axis=-1)], 1)
+        rows = self.rows or [slice(None)] * sample_blocks(self.sizes, actions.shape[-1])
+        G = np.zeros((len(actions), actions.shape[-1]), F32)
+        blocks = (np.array_split(x, len(rows), axis=-1) for x in (actions, G))
+        for own, block, into in zip(rows, *blocks):
+            into[own] = self.block(block[own], own)
+        return self.swap(G) if self.rows else G
 
-    def block(self, actions):
-        """Equation 2 for a block of samples."""
+    def block(self, actions, own):
+        """Equation 2 for a block of samples of the agents in the slice `own`."""
         m, half, G = self.sizes.latent_dim, self.sizes.mlp_dim + 1, F32(0)
         x = np.ones((len(actions), m + actions.shape[2] + 1, actions.shape[-1]), F32)  # (z, a, 1)
         for h in range(self.horizon + 1):
             x[:, m:-1] = actions[:, h]
             if h < self.horizon:
-                y = self._hidden(0, h, x)
-                out = self.to_reward @ y[:, half:]
-                np.matmul(self.to_latent, y[:, :half], out=x[:, :m])
+                y = self._hidden(0, h, x, own)
+                out = self.to_reward[own] @ y[:, half:]
+                np.matmul(self.to_latent[own], y[:, :half], out=x[:, :m])
             else:
-                out = self.to_q @ self._hidden(1, h, x)
+                out = self.to_q[own] @ self._hidden(1, h, x, own)
             G = G + F32(self.discount ** h) * out[:, 0]
         return G
 
-    def _hidden(self, pair, h, x):
+    def _hidden(self, pair, h, x, own):
         """Both hidden layers of a pair of networks (0: dynamics and reward, 1: the two Q)."""
-        y = (self.first[pair] @ x if h else
-             self.first_at_start[pair] @ x[:, self.sizes.latent_dim:])
-        y = self._norm_tanh(y) if pair else elu(y)
+        y = (self.first[pair][own] @ x if h else
+             self.first_at_start[pair][own] @ x[:, self.sizes.latent_dim:])
+        y = self._norm_tanh(y, own) if pair else elu(y)
         after, half = np.empty_like(y), y.shape[1] // 2
         for W, rows in zip(self.second[pair], (slice(0, half), slice(half, None))):
-            np.matmul(W, y[:, rows], out=after[:, rows])
+            np.matmul(W[own], y[:, rows], out=after[:, rows])
         return elu(after)
 
-    def _norm_tanh(self, y):
+    def _norm_tanh(self, y, own):
         """tanh(LayerNorm(y)) of both Q."""
-        shape, y = y.shape, y.reshape(*self.shift.shape[:3], -1)
-        y /= np.sqrt(self.spread @ (y * y) + F32(NORM_EPS))             # (N, 2, 1, S)
-        y += self.shift
+        shape, y = y.shape, y.reshape(len(y), *self.shift.shape[1:3], -1)
+        y /= np.sqrt(self.spread[own] @ (y * y) + F32(NORM_EPS))        # (N, 2, 1, S)
+        y += self.shift[own]
         return np.tanh(y, out=y).reshape(shape)
 
 
@@ -1090,10 +1098,11 @@ def sample_blocks(sizes, samples):
 
 
 def split_agents(agents, workers, blocks=1):
-    """Agents of this process and of each worker beside it, as slices; UserError for too many.
+    """Two lists, an entry for this process and for each worker beside it: its agents, a slice; and
+    None or, for each block of samples, those that it rolls out. UserError for too many workers.
 
-    Where agents don't divide evenly, neighbours share one and its `blocks` of samples: then also,
-    for each process, a slice of its agents for each block, those that it rolls out (else None)."""
+    The latter where agents don't divide evenly but come in several blocks (512 samples: in 2 or
+    4): neighbours then share one, which both plan and each rolls out in some of its blocks."""
     need(0 <= workers < agents, f"{workers} workers are no use to {agents} agents, one of which is "
          f"left to this process; pass 0 to {agents - 1}")
     cuts = np.linspace(0, agents * blocks, workers + 2).round().astype(int)
@@ -1103,29 +1112,6 @@ def split_agents(agents, workers, blocks=1):
     first = -((np.arange(blocks) - cuts[:, None]) // blocks)  # agent from each cut on, by block
     return parts, [[slice(i, j) for i, j in zip(begin - part.start, end - part.start)]
                    for part, begin, end in zip(parts, first, first[1:])]
-
-
-class SharedReturns:
-    """`Returns` where another process plans the first agent, too, or the last. Both draw the same
-    actions; of block k each rolls out the agents rows[k]; `swap` adds up what they found."""
-
-    def __init__(self, model, rows, swap):
-        self.rows, self.swap = rows, swap
-        self.parts = [Returns(model.agents(part.start, part.stop)) for part in rows]
-
-    def start(self, z, config):
-        """As that of `Returns`."""
-        for rows, part in zip(self.rows, self.parts):
-            part.start(z[rows], config)
-        return self
-
-    def __call__(self, actions):
-        """actions (N, L, d, S) -> G (N, S)."""
-        G = np.zeros((len(actions), actions.shape[-1]), F32)
-        blocks = (np.array_split(x, len(self.rows), axis=-1) for x in (actions, G))
-        for rows, part, block, into in zip(self.rows, self.parts, *blocks):
-            into[rows] = part.block(block[rows])
-        return self.swap(G)
 
 
 def cores():
@@ -1139,8 +1125,8 @@ def useful_workers(agents):
 
 
 def _planning_worker(connection):
-    """Plans for its part of the agents: latents in, actions out; a list is `reset`'s seeds. Within
-    a plan, returns of agents that are shared go out and come back added up."""
+    """Plans for its part of the agents: latents in, actions out; a list is `reset`'s seeds. Where
+    agents are shared, each iteration's returns go out and come back added up."""
     planner = AgentPlanner(*connection.recv(), lambda G: connection.send(G) or connection.recv())
     while True:
         message = connection.recv()
@@ -1720,9 +1706,10 @@ def record_key(model, config, seed):
 
 
 def record_returns(path, model, config, seed, returns):
-    """Keep the returns that `evaluate` gave beside the model's file."""
-    write_json(Path(path).with_suffix(".json"),
-               {**read_records(path), record_key(model, config, seed): returns})
+    """Keep the returns that `evaluate` gave beside the model's file, unless it holds more."""
+    records, key = read_records(path), record_key(model, config, seed)
+    if len(returns) >= len(records.get(key, [])):
+        write_json(Path(path).with_suffix(".json"), {**records, key: returns})
 
 
 def command_distill(args):

@@ -279,6 +279,7 @@ def refused(done, *parts, program="fac_tdmpc_ref.py"):
     (["--lr", "0"], ["lr", "above 0"]),
     (["--lr", "inf"], ["lr", "finite"]),
     (["--lam", "inf"], ["lam", "finite"]),
+    (["--own-episodes", "1", "--own-share", "0"], ["own_share", "above 0", "not 0.0"]),
     (["--held-out", "1"], ["held_out", "at least 0.0001 and at most 0.5"]),
     (["--held-out", "0.05"], ["replay.npz", "6 episodes are too few"]),
     (["--kl", "sideways"], ["--kl", "'sideways'", "forward"]),
@@ -722,13 +723,14 @@ def test_a_record_counts_for_its_own_weights_planner_and_episodes_only(tmp_path)
     path, model, config = tmp_path / "expert.npz", random_model(), fac.PlannerConfig()
     assert fac.read_records(path) == {}
     fac.record_returns(path, model, config, 5, [1.0, 2.0])
-    fac.record_returns(path, model, config, 5, [3.0])  # replaces it
+    fac.record_returns(path, model, config, 5, [3.0, 5.0])  # replaces it
+    fac.record_returns(path, model, config, 5, [6.0])  # doesn't: it holds less
     fac.record_returns(path, model, fac.PlannerConfig(samples=7), 5, [4.0])
     keys = [fac.record_key(*which) for which in (
         (model, config, 5), (model, fac.PlannerConfig(samples=7), 5), (model, config, 6),
         (model, fac.PlannerConfig(output="mean"), 5), (random_model(seed=1), config, 5))]
     found = fac.read_records(path)
-    assert [found.pop(key, None) for key in keys] == [[3.0], [4.0], None, None, None]
+    assert [found.pop(key, None) for key in keys] == [[3.0, 5.0], [4.0], None, None, None]
     assert not found
 
 

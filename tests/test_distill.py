@@ -41,6 +41,13 @@ def fresh(replay, config):
     return contextlib.closing(fac.Distiller(random_model(n=1, policy=True), replay, config))
 
 
+def test_a_student_is_no_expert(replay):
+    """Its encoder reads an expert's latent: no student's file could hold it as its own expert's."""
+    with fresh(replay, CONFIG) as distiller:
+        with pytest.raises(fac.UserError, match="this is a student"):
+            fac.Distiller(distiller.student, replay, CONFIG)
+
+
 def rank(distiller):
     """Of Q at each h."""
     return fac.rank_correlation(distiller, 64)[0]

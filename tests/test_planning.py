@@ -225,8 +225,7 @@ def test_an_agent_that_two_processes_share_is_planned_bit_for_bit(workers):
     config = fac.PlannerConfig(samples=500, iterations=3)
     with fac.Planner(model, config) as alone, \
             fac.Planner(model, config, workers=workers) as parallel:
-        assert isinstance(parallel.own.returns, fac.SharedReturns)
-        assert parallel.own.model.config.num_agents * (workers + 1) > 5
+        assert len(parallel.own.returns.rows) == 4
         for o in obs:
             assert np.array_equal(alone.act(o), parallel.act(o))
 
