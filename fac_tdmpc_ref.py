@@ -1181,7 +1181,7 @@ class Workers(contextlib.AbstractContextManager):
         process, connection = self._members[i]
         try:
             message = connection.recv()
-        except (EOFError, ConnectionResetError):
+        except (EOFError, OSError):  # also in the middle of a message
             process.join(1)
             message = WorkerError(f"{self._name} {i} ended with exit code {process.exitcode}; "
                                   f"the others were stopped")
@@ -1211,8 +1211,8 @@ def _run_worker(target, connection):
     with contextlib.suppress(EOFError, ConnectionError), one_thread():  # the parent is gone
         try:
             target(connection)
-        except UserError as error:
-            connection.send(error)
+        except (UserError, MemoryError) as error:
+            connection.send(UserError(str(error) or "not enough memory"))
 
 
 # ==== 6. Environments (appendix B.1) ==================================================
@@ -1317,6 +1317,15 @@ def atomic_file(path, mode="wb", **options):
     finally:
         if temporary:
             Path(temporary).unlink(missing_ok=True)
+
+
+def check_writable(path):
+    """UserError now, not after hours of work, if no file can be made beside this path."""
+    try:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=Path(path).parent).close()
+    except OSError as error:
+        raise UserError(f"{path}: can't be written: {error.strerror or error}") from error
 
 
 def write_npz(path, header, arrays, compress=False):
@@ -1458,7 +1467,7 @@ def data_file(task, name):
         shipped = ", ".join(sorted(p.parent.name for p in DATA.glob("*/expert.npz"))) or "none"
         raise UserError(f"{path}: no such file; the repository (a pip install doesn't) holds "
                         f"{shipped}. Train one with 'python data/train_expert.py --task {task}' "
-                        f"there, or name files with --expert and --replay")
+                        f"there and copy its files, or name them with --expert and --replay")
     return path
 
 
@@ -1851,6 +1860,7 @@ def command_evaluate(args):
          f"{task!r} to record its returns, found {header.get('task')!r}")
     if args.record:
         read_records(args.model)  # which it adds to: what is damaged is missed now
+        check_writable(args.model)
     found = evaluate(model, task, planning, args.episodes, args.seed, args.workers)
     returns, ms = found["returns"], found["plan_ms_median"]
     if args.record:
@@ -1962,6 +1972,8 @@ def make_parser():
 def run_command(parser, argv=None):
     """Run a command line; returns the exit status: 2, with one line, for what the user can mend."""
     args = parser.parse_args(argv)
+    if hasattr(sys.stdout, "reconfigure"):  # a terminal that has no ±
+        sys.stdout.reconfigure(errors="replace")
     try:
         result = args.run(args)
     except (UserError, MemoryError, OSError) as error:

@@ -392,7 +392,8 @@ def planner_config(args):
                  f"--{name} must be in {least} to 10**8, not {getattr(args, name)}")
     if args.figure:
         fac.need(args.figure.endswith(".png"), f"--figure {args.figure} should end in .png")
-        fac.pyplot()  # UserError now rather than after the run, where matplotlib is missing
+        fac.check_writable(args.figure)  # UserError now rather than after the run
+        fac.pyplot()
     return dataclasses.replace(TABLE_1, samples=args.samples, elites=min(5, args.samples),
                                horizon=args.horizon, discount=args.discount)
 

@@ -269,9 +269,8 @@ def distil(task, seed, case, settings):
                                    own["num_agents"], seed)
     planning = planning_for(header, {**about, "horizon": config.horizon})
     playing = dataclasses.replace(planning, **fac.OWN_BUDGET)
-    student, tap = distiller.student, case == "TAP"
-    environment = None
-    if tap:
+    student, environment = distiller.student, None
+    if case == "TAP":  # whose actions are others
         from tap import DecodingEnvironment
         environment = DecodingEnvironment(task, expert, distiller.vae)
 
@@ -287,7 +286,7 @@ def distil(task, seed, case, settings):
                 continue
             seeds = fac.episode_seeds(0, own["episodes"])
             row = summary(episodes(student, task, planning, seeds, environment)[2])
-            if not tap:  # whose actions are others
+            if not environment:
                 q, g = fac.rank_correlation(distiller, 256, planning.discount)
                 row.update(rank_q=float(q[0]), rank_return=float(g[-1]))
             yield {"step": distiller.t, **row}
@@ -300,6 +299,7 @@ FIGURE5 = {  # panel: {case: settings}; every panel holds the default
     "student temperature": {"default": {}, **{f"T_s {x}": {"temperature_student": x}
                                               for x in (0.1, 2.0)}},
     "consistency": {"default": {}, "consistency": {}}}
+FIGURE5_CASES = {case: settings for panel in FIGURE5.values() for case, settings in panel.items()}
 
 
 def distil_all(args, cases):
@@ -322,17 +322,6 @@ def data_checksums(task):
     expert, _ = fac.load_model(fac.data_file(task, "expert.npz"))
     return [*fac.data_checksums(expert, fac.Replay(fac.data_file(task, "replay.npz"))),
             fac.zlib.crc32(repr((fac.DistillConfig(), fac.PlannerConfig())).encode())]
-
-
-def command_figure4(args):
-    """figure4: the methods of B.2 by Algorithm 1."""
-    return distil_all(args, lambda task: FIGURE4.items())
-
-
-def command_figure5(args):
-    """figure5: the choices of the loss."""
-    cases = {case: settings for panel in FIGURE5.values() for case, settings in panel.items()}
-    return distil_all(args, lambda task: cases.items())
 
 
 def command_figure13(args):
@@ -379,6 +368,8 @@ def command_sweep(args):
             raise fac.UserError(f"--set {text}: expected {kind.__name__}s") from None
     for settings in (points := [dict(point) for point in itertools.product(*grid)]):
         fac.DistillConfig(**{k: v for k, v in settings.items() if k != "num_agents"})
+        for task in args.tasks:
+            fac.ModelConfig(*fac.lookup_task(task)[2:], settings.get("num_agents", 1))
     return distil_all(args, lambda task: [("sweep", settings) for settings in points])
 
 
@@ -451,7 +442,7 @@ def time_all(args, result, runs, opened):
     """Add rows with milliseconds of the runs that have none. opened(run): (model, header)."""
     timed = {tuple(row[k] for k in KEY) for row in read_rows(result["out"]) if row["ms"]}
     groups = {}  # of one budget, which take turns
-    for run in runs:
+    for run in {tuple(run.values()): run for run in runs}.values():
         if tuple(run.values()) not in timed:
             about = json.loads(run["settings"])
             groups.setdefault((run["task"], about.get("samples"), about.get("iterations")),
@@ -510,6 +501,7 @@ def follow(task, seed, case, settings):
 
 def command_figure12(args):
     """figure12: online distillation (C.1)."""
+    fac.need(args.decisions % 2000 == 0, f"--decisions: a multiple of 2000, not {args.decisions}")
     return run_all(args, follow, [
         make_run(task, seed, "online", decisions=args.decisions, episodes=args.episodes)
         for seed, task in itertools.product(args.seeds, args.tasks)])
@@ -526,7 +518,7 @@ AUTHORS = {
     "quadruped-run": (916, 825, 863, 857), "humanoid-stand": (453, 468, 823, 735),
     "humanoid-walk": (458, 227, 724, 789)}
 METHODS = ("10% TD-MPC", "TAP", "100% TD-MPC", "Fac-TDMPC")
-CASES = [*METHODS, *(case for panel in FIGURE5.values() for case in panel)]
+CASES = [*METHODS, *FIGURE5_CASES]
 
 
 def settled(path, but=()):
@@ -770,7 +762,11 @@ def command_report(args):
     fac.pyplot()
     for name, make in REPORTS.items():
         if finished(read_rows(results / f"{name}.csv")):
-            result[name], table = make(name, results / f"{name}.csv", figures)
+            try:
+                result[name], table = make(name, results / f"{name}.csv", figures)
+            except (KeyError, IndexError, ValueError) as error:
+                raise fac.UserError(f"{results / name}.csv: not {name}'s rows ({error!r})"
+                                    ) from None
             title = name.replace("figure", "Figure ").capitalize()
             text.append(f"## {title}\n\n{table}\n![]({figures_from}/{name}.png)\n")
     fac.need(result, f"{results}: no runs there; make some, e.g. with 'experiments.py figure4'")
@@ -822,12 +818,12 @@ def make_parser():
 
     walkers, steps = ["walker-walk", "walker-run"], fac.DistillConfig.steps
     shipped = sorted(path.parent.name for path in fac.DATA.glob("*/expert.npz"))
-    add_runs("figure4", command_figure4, "Section 5.2: Fac-TDMPC, TD-MPC in Table 2's size "
-             "and the small one of B.2, and TAP, by Algorithm 1; return against steps.", shipped,
-             steps=steps, evaluations=4)
-    add_runs("figure5", command_figure5, "Section 5.3: KL against MSE, the perturbations' "
-             "deviation (clipped), the student's temperature, a consistency loss.", walkers,
-             steps=steps, evaluations=4)
+    add_runs("figure4", lambda args: distil_all(args, lambda _: FIGURE4.items()),
+             "Section 5.2: Fac-TDMPC, TD-MPC in Table 2's size and the small one of B.2, and TAP, "
+             "by Algorithm 1; return against steps.", shipped, steps=steps, evaluations=4)
+    add_runs("figure5", lambda args: distil_all(args, lambda _: FIGURE5_CASES.items()),
+             "Section 5.3: KL against MSE, the perturbations' deviation (clipped), the student's "
+             "temperature, a consistency loss.", walkers, steps=steps, evaluations=4)
     add_runs("departures", command_departures, "The differences in distillation one at a time, "
              "towards the paper's values.", ["reacher-hard", "walker-walk"], steps=steps,
              evaluations=1)

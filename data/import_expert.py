@@ -418,6 +418,9 @@ def run(args):
              f"{source}: would be replaced by what is made of it; choose another --out")
     need(arrays or environment or not (out / "replay.npz").exists(), f"{out / 'replay.npz'}: "
          "another expert's; choose another --out, or pass --replay or --collect")
+    need(not (out / "checkpoint.npz").exists(), f"{out / 'checkpoint.npz'}: a run of "
+         "train_expert.py, whose files would be replaced; choose another --out")
+    fac.check_writable(out / "expert.npz")
     if environment and not arrays:
         with tempfile.TemporaryDirectory() as scratch:  # an expert is replaced with its replay
             fac.write_npz(path := Path(scratch) / "expert.npz", header, weights)

@@ -90,14 +90,16 @@ def command_watch(args):
     fac.need(args.decisions <= fac.EPISODE_STEPS, f"--decisions: an episode has "
              f"{fac.EPISODE_STEPS}, not {args.decisions}")
     fac.need(kind in (".gif", ".mp4"), f"{args.out}: expected a name that ends in .gif or .mp4")
+    fac.check_writable(args.out)
     fac.pyplot()  # brings Pillow
     if kind == ".mp4":
         with fac.optional("imageio for .mp4", "experiments"):
             import imageio_ffmpeg  # noqa: F401
-    models = [(path, *fac.load_model(path)) for path in (args.model, args.beside) if path]
-    task = args.task or models[0][2].get("task")
-    for _, model, _ in models:
-        fac.check_task(model.config, task)
+    model, header, task = open_model(args)
+    models = [(args.model, model, header)]
+    if args.beside:
+        models.append((args.beside, *fac.load_model(args.beside)))
+        fac.check_task(models[1][1].config, task)
     choose_renderer()
     environment = fac.Environment(task)
     seed = fac.episode_seeds(args.seed, args.episode + 1)[args.episode]
@@ -126,6 +128,7 @@ def pyplot_for(path):
     """matplotlib.pyplot; UserError, before the work, if no picture can be written there."""
     fac.need(Path(path).suffix == ".png" and not Path(path).is_dir(),
              f"{path}: expected the name of a .png file")
+    fac.check_writable(path)
     return fac.pyplot()
 
 
@@ -298,6 +301,6 @@ def command_agreement(args):
 def open_model(args):
     """(model, header, task) that --model and --task name."""
     model, header = fac.load_model(args.model)
-    task = args.task or header.get("task")
+    fac.need(task := args.task or header.get("task"), f"{args.model}: header: no task; pass --task")
     fac.check_task(model.config, task)
     return model, header, task

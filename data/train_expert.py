@@ -497,8 +497,11 @@ def train(args):
     training, checkpoint = Training(args, config, planning, distilling), out / "checkpoint.npz"
     if checkpoint.exists():
         training.load(checkpoint)
-    elif args.resume:
-        raise fac.UserError(f"{checkpoint}: no such file; there is nothing to resume")
+    else:
+        fac.need(not args.resume, f"{checkpoint}: no such file; there is nothing to resume")
+        for name in ("expert.npz", "replay.npz", "student.npz", "curve.csv"):
+            fac.need(not (out / name).exists(), f"{out / name}: not this run's, which would "
+                     "replace it; choose another --out")
     left = config.updates_per_step * max(0, args.steps - training.decisions)
     began, done = time.time(), False
     with contextlib.closing(Actors(args.task, min(args.workers, args.envs))) as actors, \

@@ -719,6 +719,13 @@ def test_a_student_plans_over_the_horizon_it_was_distilled_over(tmp_path, files,
     assert seen == [2, 2, 2, 0]
 
 
+def test_a_terminal_without_plus_minus_gets_its_table(tmp_path, files):
+    done = run("evaluate", "--model", files / "expert.npz", "--episodes", "1", "--workers", "0",
+               "--horizon", "0", *BUDGET, cwd=tmp_path, env={**ONE_THREAD, "PYTHONIOENCODING":
+                                                             "ascii"})
+    assert " ? " in succeeded(done).stdout
+
+
 def test_a_record_counts_for_its_own_weights_planner_and_episodes_only(tmp_path):
     path, model, config = tmp_path / "expert.npz", random_model(), fac.PlannerConfig()
     assert fac.read_records(path) == {}

@@ -40,9 +40,19 @@ def refused(done, *parts):
     (["table3", "--robots", "reecher"], ["'reecher'", *speed.ROBOTS]),
     (["table3", "--runs", "9"], ["runs", "at least 10"]),
     (["table3", "--workers", "-1"], ["--workers", "-1"]),
-    (["table3", "--elites", "600"], ["samples (512)", "not 600"])])
+    (["table3", "--elites", "600"], ["samples (512)", "not 600"]),
+    (["figure12", "--decisions", "1000"], ["--decisions", "multiple of 2000", "not 1000"])])
 def test_bad_commands_are_refused(tmp_path, flags, parts):
     refused(run(*flags, cwd=tmp_path), *parts)
+
+
+@pytest.mark.parametrize("flags", [
+    ["table3", "--figure", "file/x.png"],
+    ["watch", "--model", "none.npz", "--out", "file/x.gif"]])
+def test_pictures_that_cannot_be_written_are_missed_before_the_work(tmp_path, flags):
+    pytest.importorskip("matplotlib")
+    (tmp_path / "file").touch()  # no folder
+    refused(run(*flags, cwd=tmp_path), f"{flags[-1]}: can't be written")
 
 
 @pytest.mark.parametrize("command", [["table3", "--figure", "x.png"], ["figure6"]])
@@ -238,6 +248,7 @@ def test_dask_gives_the_rows_that_processes_give(tmp_path):
     (["sweep", "--set", "lr=fast"], ["lr=fast", "float"]),
     (["sweep", "--set", "lr=1e-3", "lr=1e-4"], ["lr", "twice"]),
     (["sweep", "--set", "kl=sideways"], ["kl", "sideways"]),
+    (["sweep", "--set", "num-agents=3,7"], ["num_agents", "[1, 3]", "not 7"]),
     (["sweep", "--set", "lr=1e-3", "--backend", "dask"], ["--scheduler"]),
     (["sweep", "--set", "lr=1e-3", "--backend", "dask", "--scheduler", "nowhere"], ["nowhere"]),
     (["figure4", "--tasks", "reecher-hard"], ["reecher-hard", "reacher-hard"]),
@@ -248,6 +259,16 @@ def test_bad_runs_are_refused(tmp_path, flags, parts):
     pytest.importorskip("joblib")
     pytest.importorskip("matplotlib")
     refused(run(*flags, cwd=tmp_path), *parts)
+
+
+@pytest.mark.parametrize("figure", ["figure7", "figure8", "figure12"])
+def test_report_names_the_file_that_holds_another_figure_s_runs(tmp_path, figure):
+    pytest.importorskip("matplotlib")
+    rows = [{**experiments.make_run("reacher-hard", 0, case, episodes=1), "step": 5,
+             "return_mean": 1.0, "minutes": 1.0} for case in ("a", "b", "c")]
+    experiments.append_rows(tmp_path / f"{figure}.csv", rows)
+    refused(run("report", "--results", ".", "--figures", ".", cwd=tmp_path), f"{figure}.csv: not "
+            f"{figure}'s rows")
 
 
 @pytest.mark.parametrize("found", [b"a,b\n1,2\n", b'{"not": "rows"}', b"\xff\xfe\n"])

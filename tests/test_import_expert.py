@@ -194,6 +194,15 @@ def test_an_expert_of_this_project_can_be_read_again(tmp_path):
     assert all(np.array_equal(after.params[k], v) for k, v in before.params.items())
 
 
+def test_a_training_run_is_not_replaced(tmp_path, capsys):
+    np.savez(tmp_path / "a.npz", **weights())
+    (tmp_path / "checkpoint.npz").touch()
+    assert import_expert.main([str(tmp_path / "a.npz"), "--task", TASK, "--collect", "2", "--out",
+                               str(tmp_path)]) == 2
+    assert "checkpoint.npz: a run of train_expert.py" in capsys.readouterr().err
+    assert not (tmp_path / "expert.npz").exists()
+
+
 def test_torch_files_agree_bit_for_bit(tmp_path):
     torch = pytest.importorskip("torch")
     torch.manual_seed(0)

@@ -355,6 +355,27 @@ def test_a_worker_that_ends_while_it_is_sent_to_says_why():
             workers.send(0, bytes(10_000_000))  # more than a pipe holds
 
 
+def wants_too_much(connection):
+    np.zeros((1 << 44,))
+
+
+def test_a_worker_without_memory_says_so():
+    with fac.Workers(wants_too_much, 1) as workers:
+        with pytest.raises(fac.UserError, match="Unable to allocate"):
+            workers.receive(0)
+
+
+def says_half(connection):
+    os.write(connection.fileno(), b"\0\0\x01\0half of a message of 256 bytes")
+    os._exit(7)
+
+
+def test_a_worker_that_dies_in_the_middle_of_a_message_is_reported():
+    with fac.Workers(says_half, 1) as workers:
+        with pytest.raises(fac.WorkerError, match="worker 0 ended with exit code 7"):
+            workers.receive(0)
+
+
 def misses_a_file(connection):
     open("/nonexistent/file")
 

@@ -211,6 +211,14 @@ def test_a_killed_run_goes_on_to_the_same_result(trained, tmp_path):
         assert weights(out, kind) == weights(trained[1], kind)
 
 
+@pytest.mark.parametrize("name", ["expert.npz", "replay.npz", "student.npz", "curve.csv"])
+def test_another_run_s_files_are_not_replaced(tmp_path, name):
+    (tmp_path / name).write_text("an hour's work")
+    done = train("--out", ".", cwd=tmp_path)
+    assert done.returncode == 2 and f"{name}: not this run's" in done.stderr
+    assert (tmp_path / name).read_text() == "an hour's work"
+
+
 @pytest.mark.parametrize("flags, parts", [
     (["--task", "reacher-eesy"], ["did you mean 'reacher-easy'"]),
     (["--resume"], ["checkpoint.npz", "nothing to resume"]),
