@@ -1053,10 +1053,10 @@ class Returns:
         G = np.zeros((len(actions), actions.shape[-1]), F32)
         blocks = (np.array_split(x, len(rows), axis=-1) for x in (actions, G))
         for own, block, into in zip(rows, *blocks):
-            into[own] = self.block(block[own], own)
+            into[own] = self._block(block[own], own)
         return self.swap(G) if self.rows else G
 
-    def block(self, actions, own):
+    def _block(self, actions, own):
         """Equation 2 for a block of samples of the agents in the slice `own`."""
         m, half, G = self.sizes.latent_dim, self.sizes.mlp_dim + 1, F32(0)
         x = np.ones((len(actions), m + actions.shape[2] + 1, actions.shape[-1]), F32)  # (z, a, 1)

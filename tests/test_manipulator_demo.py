@@ -545,15 +545,14 @@ def test_bad_input_is_one_line(args, words, capsys):
     assert captured.err.count("\n") == 1 and words in captured.err
 
 
-def test_a_figure_that_cannot_be_written_is_one_line(tmp_path, capsys, monkeypatch):
+def test_a_figure_that_cannot_be_written_is_one_line_before_the_work(tmp_path, capsys):
     pytest.importorskip("matplotlib")
-    monkeypatch.setattr(demo, "goal_map", lambda rng: np.zeros((60, 60)))  # it takes seconds
     (tmp_path / "file").write_text("old")
     path = str(tmp_path / "file" / "arm.png")
     assert demo.main(["--steps", "1", "--ik", "closed-form", "--figure", path, "--json"]) == 2
     captured = capsys.readouterr()
     assert captured.err.count("\n") == 1 and "can't be written" in captured.err
-    assert "speed-up" in captured.out  # what was measured is not lost
+    assert captured.out == ""
 
 
 @pytest.mark.parametrize("args", [
