@@ -49,6 +49,11 @@ def make_run(task, seed, case, **settings):
             "settings": json.dumps(settings, sort_keys=True)}
 
 
+def unique(runs):
+    """Each run once, in their order: a task, a seed or a value may be named twice."""
+    return list({tuple(run.values()): run for run in runs}.values())
+
+
 def read_rows(path):
     """A CSV's rows, dicts of strings; without a line that a kill cut off."""
     text = Path(path).read_text("utf-8", "replace") if Path(path).exists() else ""
@@ -124,10 +129,9 @@ def run_all(args, function, runs):
     for task in args.tasks:
         fac.lookup_task(task)
     path = Path(args.out or RESULTS / f"{args.command}.csv")
-    done = finished(read_rows(path))
-    runs = list({tuple(run.values()): run for run in runs}.values())
+    done, failed, where = finished(read_rows(path)), [], connect(args)
+    runs = unique(runs)
     todo = [run for run in runs if tuple(run.values()) not in done]
-    failed, where = [], connect(args)
     append_rows(path, [])  # what can't be written is missed now
     with fac.progress(args.command, len(runs), "run", len(runs) - len(todo)) as bar, \
             joblib.parallel_config(**where):
@@ -442,7 +446,7 @@ def time_all(args, result, runs, opened):
     """Add rows with milliseconds of the runs that have none. opened(run): (model, header)."""
     timed = {tuple(row[k] for k in KEY) for row in read_rows(result["out"]) if row["ms"]}
     groups = {}  # of one budget, which take turns
-    for run in {tuple(run.values()): run for run in runs}.values():
+    for run in unique(runs):
         if tuple(run.values()) not in timed:
             about = json.loads(run["settings"])
             groups.setdefault((run["task"], about.get("samples"), about.get("iterations")),
