@@ -199,7 +199,7 @@ class DistillConfig(Settings):
     own_episodes: int = field(16, "episodes that the student plays after each of the first three "
                               "quarters of the steps, to learn from [D8]", paper=0, least=0)
     own_share: float = field(0.25, "share of states from these [D8]", paper=0.0, least=0, most=1)
-    held_out: float = field(0.05, "share of episodes held out, for rank correlations",
+    held_out: float = field(0.05, "about this share of episodes is held out, to rank correlations",
                             least=1e-4, most=0.5)
 
     def __post_init__(self):
@@ -233,13 +233,13 @@ def from_dict(config_class, values, where):
         raise UserError(f"{where}: {error}") from None
 
 
-def student_config(expert, num_agents, sizes, encoder_input):
-    """A student's ModelConfig: Table 2's or section 5.1's latent; hidden max(512 // N, 50)."""
+def student_config(theirs, num_agents, sizes, encoder_input):
+    """A student's ModelConfig, from its expert's: a latent by `sizes`, hidden max(512 // N, 50)."""
     width = 512 // max(1, num_agents)
     below = {} if encoder_input == "observation" else {
-        "expert_latent_dim": expert.num_agents * expert.latent_dim,
-        "expert_enc_dim": expert.enc_dim}
-    return ModelConfig(expert.dim_obs, expert.dim_action, num_agents,
+        "expert_latent_dim": theirs.num_agents * theirs.latent_dim,
+        "expert_enc_dim": theirs.enc_dim}
+    return ModelConfig(theirs.dim_obs, theirs.dim_action, num_agents,
                        50 if sizes == "table2" else width, 256, max(width, 50), **below)
 
 
@@ -305,7 +305,7 @@ def norm(x, g, b):
 
 
 def norm_backward(dy, x, g):
-    """Gradients of y = g x_hat + b; x_hat has no part that shifts or scales all features."""
+    """Gradients of y = g x_hat + b; dx loses its mean and its part along x_hat, as x did."""
     x_hat, scale = standardize(x)
     db = dy.sum(2, keepdims=True)
     dg = np.einsum("nfb,nfb->nf", dy, x_hat)[:, :, None]
@@ -599,7 +599,7 @@ def soft_kl(student, expert, temperature_student, temperature_expert, kind="forw
 
 
 def distill_loss(student, features, actions, targets, config, grads=None, divergence=soft_kl):
-    """The loss in line 6 of Algorithm 1, of Q twice, and, into the dict `grads`, its gradients.
+    """Line 6 of Algorithm 1, with Table 2's coefficients, for both Q; adds gradients to `grads`.
 
         mean over B of sum_h lambda^h [c_R D(R_h) + c_Q (D(Q1_h) + D(Q2_h))]
 
@@ -626,7 +626,7 @@ def distill_loss(student, features, actions, targets, config, grads=None, diverg
 
 
 def new_student(expert, sizes, seed):
-    """Adam on the trained weights of a fresh student of an expert, and that student.
+    """A fresh student of an expert, behind Adam on those of its weights that are trained.
 
     Where the student reads the expert's latent, it shares the expert's own encoder arrays [D3]."""
     student = WorldModel.create(sizes, stream(seed, "student"))
@@ -637,7 +637,7 @@ def new_student(expert, sizes, seed):
 
 
 def learning_rate(config, t):
-    """A linear rise over `warmup` steps, times one or half a cosine down to zero [D1]."""
+    """A linear rise over `warmup` steps, times 1 or (1 + cos) / 2, which ends at 0 [D1]."""
     rate = config.lr * min(1.0, (t + 1) / max(1, config.warmup))
     if config.lr_schedule == "cosine":
         rate *= 0.5 * (1 + np.cos(np.pi * min(1.0, t / config.steps)))
@@ -656,7 +656,7 @@ def perturbed_batch(expert, student, obs, actions, config, rng):
     return features, perturbed, predict(expert, z, perturbed)
 
 
-POOL, PART = 4096, 256  # states whose expert's predictions are computed in one go, by such parts
+POOL, PART = 4096, 256  # states that the expert predicts at once, and a thread's part of them
 OWN_BUDGET = {"samples": 64, "iterations": 3, "elites": 0}  # MPPI's in own episodes [D8]
 
 
@@ -669,7 +669,7 @@ class Distiller:
 
     loss = staticmethod(distill_loss)
 
-    def __init__(self, expert, replay, config, num_agents=None, seed=0, sizes=None):
+    def __init__(self, expert, replay, config, num_agents=None, seed=0, **sizes):
         theirs = expert.config
         self.train_starts, self.held_out_starts = replay.starts(config.horizon + 1, config.held_out)
         need((replay.dim_obs, replay.dim_action) == (theirs.dim_obs, theirs.dim_action),
@@ -682,17 +682,17 @@ class Distiller:
         self.own = np.zeros((0, EPISODE_STEPS, replay.dim_obs + replay.dim_action), np.float16)
         agents = theirs.dim_action if num_agents is None else num_agents
         with one_thread():
-            self.optimizer, self.student = new_student(expert, sizes or student_config(
-                theirs, agents, config.sizes, config.encoder_input), seed)
+            self.optimizer, self.student = new_student(expert, dataclasses.replace(student_config(
+                theirs, agents, config.sizes, config.encoder_input), **sizes), seed)
         needed = config.steps * config.batch_size // config.reuse
         self.pool_size = max(config.batch_size, min(POOL, needed))
-        self._number = self._pool = None
+        self._number = None
         self._threads = ThreadPoolExecutor(2)
         self._halves = [flatten({k: np.zeros_like(v) for k, v in self.optimizer.params.items()})
                         for _ in range(2)]
 
     def draw(self, number, part, size):
-        """Line 4 and the expert's part of line 6 for a part of a pool, as `perturbed_batch`."""
+        """Lines 4 and 6 (expert) for `size` states, a pool's part, as `perturbed_batch`."""
         rng, L = stream(self.seed, f"pool {number}", part), self.config.horizon + 1
         K, dim_obs = self.config.noise_samples, self.replay.dim_obs
         obs, actions = self.replay.sequences(rng.choice(self.train_starts, size), L)
@@ -715,9 +715,9 @@ class Distiller:
         size, reuse = self.config.batch_size, self.config.reuse
         number, step = divmod(t, reuse * self.pool_size // size)  # which pool, which of its steps
         if number != self._number:
-            sizes = np.diff(np.r_[0:self.pool_size:PART, self.pool_size])
+            lengths = np.diff(np.r_[0:self.pool_size:PART, self.pool_size])
             features, actions, targets = zip(*self._threads.map(
-                self.draw, itertools.repeat(number), itertools.count(), sizes))
+                self.draw, itertools.repeat(number), itertools.count(), lengths))
             self._pool = (np.concatenate(features, 2), np.concatenate(actions, 2),
                           [np.concatenate(target, 1) for target in zip(*targets)])
             rng, self._number = stream(self.seed, "order", number), number
@@ -746,16 +746,16 @@ class Distiller:
             self.optimizer.step(learning_rate(self.config, self.t), self.config.grad_clip)
         return tuple(total.tolist())
 
-    def run(self, play=None):
+    def run(self, play_own=None):
         """Algorithm 1 from here to its end; yields the losses of each step.
 
-        play(first, count): lets the student play episodes first, ..., first + count - 1 of its
+        play_own(first, count): lets the student play episodes first, ..., first + count - 1 of its
         own and returns what `add` takes; not needed without own episodes [D8]."""
-        need(play or not self.config.own_episodes, "pass `play`, or configure own_episodes=0")
+        need(play_own or not self.config.own_episodes, "pass `play_own`, or set own_episodes=0")
         while self.t < self.config.steps:
             played, quarter = len(self.own), 4 * self.t // self.config.steps
             if quarter * self.config.own_episodes > played:
-                self.add(*play(played, quarter * self.config.own_episodes - played))
+                self.add(*play_own(played, quarter * self.config.own_episodes - played))
             yield self.step()
 
     @property
@@ -811,9 +811,9 @@ def rank_correlation(distiller, states, discount=0.99):
     with one_thread():
         x, actions, expert = perturbed_batch(distiller.expert, student, obs, actions[..., None],
                                              config, rng)
-        own = predict(student, student.encode_features(x), actions)
-    return (spearman(expert[1] + expert[2], own[1] + own[2]).mean(-1),
-            spearman(*(horizon_returns(*out, discount) for out in (expert, own))).mean(-1))
+        found = predict(student, student.encode_features(x), actions)
+    return (spearman(expert[1] + expert[2], found[1] + found[2]).mean(-1),
+            spearman(*(horizon_returns(*out, discount) for out in (expert, found))).mean(-1))
 
 
 # ==== 5. Planning: MPPI (Equations 2 and 3), then the worker processes ================
@@ -834,24 +834,24 @@ def h_step_return(model, z, actions, config):
     return G + gamma ** config.horizon * (q1 + q2) / 2
 
 
-def mppi(rollout, mean, config, rngs, proposals=None):
+def mppi(returns, mean, config, rngs, proposals=None):
     """MPPI: refine a Gaussian over action sequences by its elites, for each agent alone.
 
-    rollout: actions (N, L, d, S) -> returns (N, S); mean (N, L, d): the first Gaussian's; rngs:
+    returns: actions (N, L, d, S) -> G (N, S); mean (N, L, d): the first Gaussian's; rngs:
     one Generator for each agent; proposals (N, L, d, P): sequences that compete in every iteration.
     Elites are chosen agent by agent (Equation 3): G is a sum of G_i(a_i), so the best of each is
     the best of all (Proposition 1). N = 1 is centralized MPPI. Returns the new mean (N, L, d), the
     last elites (N, L, d, E) and their scores (N, E), which sum to 1."""
     mean, std = mean[..., None], F32(config.max_std)
     if proposals is not None:
-        G_proposals = rollout(proposals)
+        G_proposals = returns(proposals)
     for _ in range(config.iterations):
         actions = np.stack([rng.standard_normal((*mean.shape[1:3], config.samples), F32)
                             for rng in rngs])
         actions *= std
         actions += mean
         np.clip(actions, -1, 1, out=actions)
-        G = rollout(actions)
+        G = returns(actions)
         if proposals is not None:
             actions = np.concatenate([actions, proposals], -1)
             G = np.concatenate([G, G_proposals], 1)
@@ -887,7 +887,7 @@ def policy_noise(shape, rng):
 
 
 class AgentPlanner:
-    """Plans for the agents of one model: the same for all of them, for a part, for N = 1.
+    """Plans for the agents of one model, whether they are all, a part, or one.
 
     rows, swap: for `Returns`, where an agent is another process's, too."""
 
@@ -906,9 +906,9 @@ class AgentPlanner:
     def plan(self, z):
         """z (N, m, 1) -> the agents' first actions (N, d); keeps the warm start."""
         config = self.config
-        rollout = (self.returns.start(z, config) if self.returns else
+        returns = (self.returns.start(z, config) if self.returns else
                    functools.partial(h_step_return, self.model, z, config=config))
-        mean, elites, scores = mppi(rollout, self.mean, config, self.rngs, self._proposals(z))
+        mean, elites, scores = mppi(returns, self.mean, config, self.rngs, self._proposals(z))
         self.mean = np.concatenate([mean[:, 1:], np.zeros_like(mean[:, :1])], 1)
         return mean[:, 0] if config.output == "mean" else draw_elite(elites, scores, self.rngs)
 
@@ -1022,7 +1022,7 @@ class Returns:
     def _fold_norm(self, p):
         """First layers of both Q, after which LayerNorm is y / sqrt(spread @ y^2 + eps) + shift.
 
-        Centred rows give centred outputs, and rows times their gain outputs times theirs;
+        Centred rows give centred outputs, and a row times its gain gives its output times it;
         `spread` takes the gains out of the variance again. The row of ones becomes zeros here,
         and 20 by `shift`, which tanh takes to 1."""
         rows = (self.sizes.num_agents, 2, self.sizes.mlp_dim + 1)
@@ -1052,40 +1052,40 @@ class Returns:
         rows = self.rows or [slice(None)] * sample_blocks(self.sizes, actions.shape[-1])
         G = np.zeros((len(actions), actions.shape[-1]), F32)
         blocks = (np.array_split(x, len(rows), axis=-1) for x in (actions, G))
-        for own, block, into in zip(rows, *blocks):
-            into[own] = self._block(block[own], own)
+        for agents, block, into in zip(rows, *blocks):
+            into[agents] = self._block(block[agents], agents)
         return self.swap(G) if self.rows else G
 
-    def _block(self, actions, own):
-        """Equation 2 for a block of samples of the agents in the slice `own`."""
+    def _block(self, actions, agents):
+        """Equation 2 for a block of samples of the agents in the slice `agents`."""
         m, half, G = self.sizes.latent_dim, self.sizes.mlp_dim + 1, F32(0)
         x = np.ones((len(actions), m + actions.shape[2] + 1, actions.shape[-1]), F32)  # (z, a, 1)
         for h in range(self.horizon + 1):
             x[:, m:-1] = actions[:, h]
             if h < self.horizon:
-                y = self._hidden(0, h, x, own)
-                out = self.to_reward[own] @ y[:, half:]
-                np.matmul(self.to_latent[own], y[:, :half], out=x[:, :m])
+                y = self._hidden(0, h, x, agents)
+                out = self.to_reward[agents] @ y[:, half:]
+                np.matmul(self.to_latent[agents], y[:, :half], out=x[:, :m])
             else:
-                out = self.to_q[own] @ self._hidden(1, h, x, own)
+                out = self.to_q[agents] @ self._hidden(1, h, x, agents)
             G = G + F32(self.discount ** h) * out[:, 0]
         return G
 
-    def _hidden(self, pair, h, x, own):
+    def _hidden(self, pair, h, x, agents):
         """Both hidden layers of a pair of networks (0: dynamics and reward, 1: the two Q)."""
-        y = (self.first[pair][own] @ x if h else
-             self.first_at_start[pair][own] @ x[:, self.sizes.latent_dim:])
-        y = self._norm_tanh(y, own) if pair else elu(y)
+        y = (self.first[pair][agents] @ x if h else
+             self.first_at_start[pair][agents] @ x[:, self.sizes.latent_dim:])
+        y = self._norm_tanh(y, agents) if pair else elu(y)
         after, half = np.empty_like(y), y.shape[1] // 2
         for W, rows in zip(self.second[pair], (slice(0, half), slice(half, None))):
-            np.matmul(W[own], y[:, rows], out=after[:, rows])
+            np.matmul(W[agents], y[:, rows], out=after[:, rows])
         return elu(after)
 
-    def _norm_tanh(self, y, own):
+    def _norm_tanh(self, y, agents):
         """tanh(LayerNorm(y)) of both Q."""
         shape, y = y.shape, y.reshape(len(y), *self.shift.shape[1:3], -1)
-        y /= np.sqrt(self.spread[own] @ (y * y) + F32(NORM_EPS))        # (N, 2, 1, S)
-        y += self.shift[own]
+        y /= np.sqrt(self.spread[agents] @ (y * y) + F32(NORM_EPS))     # (N, 2, 1, S)
+        y += self.shift[agents]
         return np.tanh(y, out=y).reshape(shape)
 
 
@@ -1101,8 +1101,8 @@ def split_agents(agents, workers, blocks=1):
     """Two lists, an entry for this process and for each worker beside it: its agents, a slice; and
     None or, for each block of samples, those that it rolls out. UserError for too many workers.
 
-    The latter where agents don't divide evenly but come in several blocks (512 samples: in 2 or
-    4): neighbours then share one, which both plan and each rolls out in some of its blocks."""
+    The latter where agents don't divide evenly but blocks do (512 samples are 2 or 4): of 3 agents
+    in 2 blocks both processes plan agent 1; its first block is rolled out here, the other there."""
     need(0 <= workers < agents, f"{workers} workers are no use to {agents} agents, one of which is "
          f"left to this process; pass 0 to {agents - 1}")
     cuts = np.linspace(0, agents * blocks, workers + 2).round().astype(int)
@@ -1496,18 +1496,18 @@ def _playing_worker(connection):
         connection.send(part)
 
 
-def play(model, task, config, seeds, workers=None, label="playing"):
+def play(model, task, config, seeds, workers=None, label="playing", environment=None):
     """Plan through the episodes of `seeds`: observations (E, T, O), actions (E, T, A), rewards
     (E, T) and seconds of planning (E, T), with T = EPISODE_STEPS.
 
-    workers: processes that share the episodes [one for each core]; 0: all in this one. An episode
-    depends on its seed alone, so that number changes nothing."""
+    workers: processes that share the episodes [one for each core]; 0: all in this one, which alone
+    can use an `environment`. An episode depends on its seed, not on their number."""
     E, T, sizes = len(seeds), EPISODE_STEPS, model.config
     found = [np.zeros((E, T, *shape), F32) for shape in ((sizes.dim_obs,), (sizes.dim_action,))]
     found += [np.zeros((E, T)) for _ in range(2)]
     workers = min(cores() if workers is None else workers, E)
     parts = [range(w, E, workers or 1) for w in range(workers or 1)]
-    here, done = decisions(model, task, config, seeds), [0] * len(parts)
+    here, done = decisions(model, task, config, seeds, environment), [0] * len(parts)
     with progress(label, E * T, "decision") as bar, \
             Workers(_playing_worker, workers, "evaluation worker") as pool:
         pool.send_all((model, task, config, [seeds[i] for i in part]) for part in parts)
@@ -1755,7 +1755,7 @@ def load_data(args):
         need(header.get(key) == expected, f"{path}: header: {key}: expected {expected!r}, found "
              f"{header.get(key)!r}")
     check_task(expert.config, args.task)
-    Environment(args.task)  # what is missing is missed now, not after the last step
+    Environment(args.task), read_records(path)  # what is missing is missed now
     replay = Replay(args.replay or path.with_name("replay.npz"))
     return expert, header, replay, path
 
@@ -1788,17 +1788,18 @@ def distil_and_save(distiller, args, planning, header, out):
 def evaluate_both(expert, path, student, args, planning):
     """The student's returns and the expert's, recorded or measured: result's part."""
     where = args.episodes, args.eval_seed, args.workers
-    own = evaluate(student, args.task, planning, *where, "evaluating the student")["returns"]
+    returns = {"student": evaluate(student, args.task, planning, *where, "evaluating the student"
+                                   )["returns"]}
     record = read_records(path).get(record_key(expert, planning, args.eval_seed), [])
     recorded = len(record) >= args.episodes and not args.evaluate_expert
-    returns = record[:args.episodes] if recorded else evaluate(
+    returns["expert"] = record[:args.episodes] if recorded else evaluate(
         expert, args.task, planning, *where, "evaluating the expert")["returns"]
+    mean = {who: float(np.mean(x)) for who, x in returns.items()}
     return {"episodes": args.episodes, "expert_recorded": recorded,
-            "expert_return_mean": float(np.mean(returns)),
-            "expert_return_std": float(np.std(returns)), "expert_returns": returns,
-            "student_return_mean": float(np.mean(own)),
-            "student_return_std": float(np.std(own)), "student_returns": own,
-            "kept": return_kept(np.mean(own), np.mean(returns))}
+            "kept": return_kept(mean["student"], mean["expert"]),
+            **{f"{who}_return_mean": x for who, x in mean.items()},
+            **{f"{who}_return_std": float(np.std(x)) for who, x in returns.items()},
+            **{f"{who}_returns": x for who, x in returns.items()}}
 
 
 def time_both(expert, student, planning, obs):
@@ -1809,10 +1810,10 @@ def time_both(expert, student, planning, obs):
         acts = [stack.enter_context(Planner(model, planning, workers=workers)).act
                 for model, workers in ((expert, 0), *((student, n) for n in sorted({0, beside})))]
         seconds = interleaved_seconds([functools.partial(act, obs) for act in acts], 20, "timing")
-    central, *own = (1e3 * np.median(seconds, 0)).tolist()
-    return {"plan_ms_expert": central, "plan_ms_student_in_process": own[0],
-            "plan_ms_student": min(own), "speedup": central / min(own),
-            "plan_workers": beside if min(own) < own[0] else 0}
+    central, alone, *parallel = (1e3 * np.median(seconds, 0)).tolist()
+    best = min([alone, *parallel])
+    return {"plan_ms_expert": central, "plan_ms_student_in_process": alone, "plan_ms_student": best,
+            "speedup": central / best, "plan_workers": beside if best < alone else 0}
 
 
 def report(result, planning, eval_seed):

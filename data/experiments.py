@@ -126,8 +126,6 @@ def run_all(args, function, runs):
     """function(task, seed, case, settings), rows, of all runs that the CSV doesn't hold; result."""
     with fac.optional("joblib", "experiments"):
         import joblib
-    for task in args.tasks:
-        fac.lookup_task(task)
     path = Path(args.out or RESULTS / f"{args.command}.csv")
     done, failed, where = finished(read_rows(path)), [], connect(args)
     runs = unique(runs)
@@ -173,15 +171,10 @@ def planning_for(header, about):
     return fac.PlannerConfig(**{**fac.made_for(header, "model"), **own})
 
 
-def episodes(model, task, planning, seeds, environment=None):
-    """Observations (E, T, O), actions (E, T, A) and returns (E,) of a model, in this process."""
-    obs, actions, rewards, _ = zip(*fac.decisions(model, task, planning, seeds, environment))
-    return (*(np.reshape(x, (len(seeds), fac.EPISODE_STEPS, -1)) for x in (obs, actions)),
-            np.reshape(rewards, (len(seeds), -1)).sum(1))
-
-
-def summary(returns):
-    """A row's columns of episodes' returns."""
+def measure(model, task, planning, count, environment=None):
+    """A row's columns of the returns of `count` episodes of evaluation seed 0, in this process."""
+    returns = fac.play(model, task, planning, fac.episode_seeds(0, count), 0, "evaluating",
+                       environment)[2].sum(1)
     return {"return_mean": float(returns.mean()), "return_std": float(returns.std()),
             "return_min": float(returns.min())}
 
@@ -245,8 +238,7 @@ class SmallDistiller(fac.Distiller):
     """B.2's 10% TD-MPC: centralized, hidden layers of 66 (3% of the weights behind the encoder)."""
 
     def __init__(self, expert, replay, config, num_agents=1, seed=0):
-        sizes = fac.student_config(expert.config, 1, config.sizes, config.encoder_input)
-        super().__init__(expert, replay, config, 1, seed, dataclasses.replace(sizes, mlp_dim=66))
+        super().__init__(expert, replay, config, 1, seed, mlp_dim=66)
 
 
 def distiller_of(case):
@@ -280,7 +272,7 @@ def distil(task, seed, case, settings):
 
     def play_own(first, count):
         seeds = fac.training_seeds(seed, "own episode", first, count)
-        return episodes(student, task, playing, seeds, environment)[:2]
+        return fac.play(student, task, playing, seeds, 0, "the student plays", environment)[:2]
 
     every = -(-config.steps // own["evaluations"])
     with contextlib.closing(distiller):
@@ -288,8 +280,7 @@ def distil(task, seed, case, settings):
             fac.check_finite({"loss is": losses}, distiller.t, config.lr)
             if distiller.t % every and distiller.t < config.steps:
                 continue
-            seeds = fac.episode_seeds(0, own["episodes"])
-            row = summary(episodes(student, task, planning, seeds, environment)[2])
+            row = measure(student, task, planning, own["episodes"], environment)
             if not environment:
                 q, g = fac.rank_correlation(distiller, 256, planning.discount)
                 row.update(rank_q=float(q[0]), rank_return=float(g[-1]))
@@ -412,8 +403,7 @@ def plan_with(task, seed, case, settings, students):
     planning = planning_for(header, settings)
     environment = (DisturbedEnvironment(task, settings["joint"], settings["kind"])
                    if settings.get("kind") else None)
-    seeds = fac.episode_seeds(0, settings["episodes"])
-    yield summary(episodes(model, task, planning, seeds, environment)[2])
+    yield measure(model, task, planning, settings["episodes"], environment)
 
 
 class DisturbedEnvironment(fac.Environment):
@@ -506,6 +496,8 @@ def follow(task, seed, case, settings):
 def command_figure12(args):
     """figure12: online distillation (C.1)."""
     fac.need(args.decisions % 2000 == 0, f"--decisions: a multiple of 2000, not {args.decisions}")
+    for task in args.tasks:
+        fac.lookup_task(task)
     return run_all(args, follow, [
         make_run(task, seed, "online", decisions=args.decisions, episodes=args.episodes)
         for seed, task in itertools.product(args.seeds, args.tasks)])
@@ -791,13 +783,15 @@ def make_parser():
     sub = fac.add_command(
         commands, "table3", command_table3, "Planning speed: Table 3 (the networks) and whole "
         "decisions, centralized and factored, in one process and in several.",
-        epilog="Weights are fresh. Keep the machine quiet, read ratios.", aliases=["figure6"])
+        epilog="Weights are fresh, without a policy. Keep the machine quiet, read ratios.",
+        aliases=["figure6"])
     sub.add_argument("--robots", nargs="+", default=list(ROBOTS), choices=ROBOTS, metavar="ROBOT",
                      help="some of: " + ", ".join(ROBOTS) + " [all]")
     sub.add_argument("--workers", type=fac.natural, help="beside this process [as many as help]")
     sub.add_argument("--runs", type=ten, default=100, help="timings; of decisions a tenth [100]")
     sub.add_argument("--figure", help="draw it into this file [figure6: data/figures/figure6.png]")
-    fac.add_config(sub, fac.PlannerConfig, **fac.paper_preset(fac.PlannerConfig))
+    fac.add_config(sub, fac.PlannerConfig, skip=("pi_trajs",),
+                   **fac.paper_preset(fac.PlannerConfig))
     def add_runs(name, run, help, tasks, **defaults):
         sub = fac.add_command(commands, name, run, help, epilog="The same command again makes "
                               "the runs that are missing in the CSV, and only these.")
@@ -847,7 +841,7 @@ def make_parser():
     for name in ("figure7", "figure13"):
         add = commands.choices[name].add_argument
         add("--rounds", type=positive, default=20, help="timings of each [20]")
-    sub = add_runs("sweep", command_sweep, "A grid over any settings of distill.",
+    sub = add_runs("sweep", command_sweep, "A grid over Algorithm 1's settings and num-agents.",
                    ["reacher-hard"], steps=steps, evaluations=1)
     sub.add_argument("--set", nargs="+", required=True, metavar="SETTING=VALUE,...",
                      help="e.g. lr=1e-3,3e-4 batch-size=16,32; see distill --help")
@@ -861,8 +855,8 @@ def make_parser():
     sub.add_argument("--figures", default=fac.DATA / "figures", help="[data/figures]")
     sub = fac.add_command(
         commands, "watch", command_watch, "An episode as a moving picture: beside the robot a bar "
-        "for each agent, what its plan is worth above doing nothing (scaled for each model); "
-        "below, a decision's time.")
+        "for each agent, what a plan made anew is worth above doing nothing (each model has its "
+        "scale); below, a decision's time.")
     sub.add_argument("--model", required=True, help="an expert.npz or student.npz")
     sub.add_argument("--beside", help="another one, on the same episode")
     sub.add_argument("--task", help="one of: " + ", ".join(fac.TASKS) + " [the model's own]")

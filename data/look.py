@@ -28,7 +28,7 @@ def choose_renderer():
 
 
 def shares(model, z, config):
-    """What each agent's own plan from z (N, m, 1) is worth to it above doing nothing, (N,)."""
+    """What a plan that each agent makes anew from z (N, m, 1) is worth above doing nothing (N,)."""
     n = model.config.num_agents
     returns = functools.partial(fac.h_step_return, model, z, config=config)
     nothing = np.zeros((n, config.horizon + 1, model.config.agent_actions), fac.F32)

@@ -96,14 +96,6 @@ def benchmark_prediction(robot, workers, runs):
             for (model, mode, f, _), s in zip(calls, seconds.T)]
 
 
-MATRIX = np.ones((512, 512), fac.F32)
-
-
-def gemm():
-    """A product of 512 x 512 matrices: the machine's rate, which sets the floor."""
-    return MATRIX @ MATRIX
-
-
 def benchmark_decisions(robot, workers, planning, rounds):
     """Whole decisions for one robot: rows of robot, model, preset, mode, samples, iterations,
     ms_median, floor_ms, ratio_to_floor; and the microseconds of a hand-over to the workers."""
@@ -116,7 +108,7 @@ def benchmark_decisions(robot, workers, planning, rounds):
         budgets.append(dataclasses.replace(planning, iterations=2))
     presets = {"table2": ((50, 512), (50, max(512 // n, 50))),
                "section51": ((512, 512), (512 // n, 512 // n))}
-    subjects = []
+    subjects, matrix = [], np.ones((512, 512), fac.F32)  # whose square is the machine's rate
     with contextlib.ExitStack() as stack:
         def planner(model, config, workers=0):
             return stack.enter_context(fac.Planner(model, config, workers=workers))
@@ -133,8 +125,8 @@ def benchmark_decisions(robot, workers, planning, rounds):
                     ("Fac-TDMPC", preset, "critical-path", factored.agents(0, 1), config,
                      one_agent(factored, config))]
         seconds = fac.interleaved_seconds(
-            [gemm, *(functools.partial(subject[-1], obs) for subject in subjects)], rounds,
-            f"{robot}: decisions")
+            [lambda: matrix @ matrix, *(functools.partial(subject[-1], obs)
+                                        for subject in subjects)], rounds, f"{robot}: decisions")
         echo = stack.enter_context(fac.Workers(_echo_worker, workers, "echo worker"))
         hand_over = fac.interleaved_seconds([functools.partial(wake, echo)], 200,
                                             f"{robot}: hand-over")

@@ -3,9 +3,8 @@
 A variational autoencoder (VAE) maps actions to latent actions and back; as in TAP, both ways see
 the state, here the expert's latent. The student learns from encoded actions by Algorithm 1 as any
 other does; MPPI plans latent actions, of which the robot gets the first, decoded. The VAE learns
-before, from its reconstruction loss alone, and stays as it is then.
+before, from its own loss (reconstruction and KL to the prior), and stays as it is then.
 """
-import dataclasses
 import sys
 from pathlib import Path
 
@@ -74,9 +73,7 @@ class TapDistiller(fac.Distiller):
     """Algorithm 1 for a centralized student of latent actions."""
 
     def __init__(self, expert, replay, config, num_agents=1, seed=0, vae_steps=3_000):
-        sizes = fac.student_config(expert.config, 1, config.sizes, config.encoder_input)
-        super().__init__(expert, replay, config, 1, seed,
-                         dataclasses.replace(sizes, dim_action=LATENT_ACTION))
+        super().__init__(expert, replay, config, 1, seed, dim_action=LATENT_ACTION)
         rng = fac.stream(seed, "action VAE")
         self.vae = ActionVAE(expert.config.latent_dim, expert.config.dim_action, rng)
 

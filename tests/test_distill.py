@@ -264,10 +264,11 @@ def test_odd_settings_learn_all_the_same(replay, odd, n):
 
 
 @pytest.mark.parametrize("encoder_input", ["latent", "observation"])
-def test_sizes_of_one_s_own_say_what_the_encoder_reads(tmp_path, replay, encoder_input):
-    expert = random_model(n=1)
+def test_sizes_of_one_s_own_leave_what_the_encoder_reads(tmp_path, replay, encoder_input):
+    expert, config = random_model(n=1), fac.dataclasses.replace(CONFIG, encoder_input=encoder_input)
     sizes = fac.student_config(expert.config, 3, "table2", encoder_input)
-    with contextlib.closing(fac.Distiller(expert, replay, CONFIG, sizes=sizes)) as distiller:
+    with contextlib.closing(fac.Distiller(expert, replay, config, mlp_dim=7)) as distiller:
+        assert distiller.student.config == fac.dataclasses.replace(sizes, mlp_dim=7)
         distiller.step()
         fac.save_model(tmp_path / "student.npz", distiller.student, {"kind": "student"})
     student, _ = fac.load_model(tmp_path / "student.npz")
