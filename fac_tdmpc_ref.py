@@ -199,7 +199,7 @@ class DistillConfig(Settings):
     own_episodes: int = field(16, "episodes that the student plays after each of the first three "
                               "quarters of the steps, to learn from [D8]", paper=0, least=0)
     own_share: float = field(0.25, "share of states from these [D8]", paper=0.0, least=0, most=1)
-    held_out: float = field(0.05, "about this share of episodes is held out, to rank correlations",
+    held_out: float = field(0.05, "about this share of episodes is held out, for rank correlations",
                             least=1e-4, most=0.5)
 
     def __post_init__(self):
@@ -305,7 +305,7 @@ def norm(x, g, b):
 
 
 def norm_backward(dy, x, g):
-    """Gradients of y = g x_hat + b; dx loses its mean and its part along x_hat, as x did."""
+    """Gradients of y = g x_hat + b; dx loses its mean and its part along x_hat (LayerNorm)."""
     x_hat, scale = standardize(x)
     db = dy.sum(2, keepdims=True)
     dg = np.einsum("nfb,nfb->nf", dy, x_hat)[:, :, None]

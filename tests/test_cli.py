@@ -59,6 +59,8 @@ def files(tmp_path_factory):
     write_expert(folder / "expert.npz")
     write_expert(folder / "other.npz", seed=1)
     write_expert(folder / "wider.npz", latent=7)
+    write_expert(folder / "spoilt.npz")
+    (folder / "spoilt.json").write_text('{"x": 3}')
     write_replay(folder / "replay.npz")
     write_replay(folder / "walker.npz", dims=(24, 6))
     write_replay(folder / "longer.npz", episodes=3, rows=60)  # the same rows, other ends
@@ -304,6 +306,7 @@ def refused(done, *parts, program="fac_tdmpc_ref.py"):
     (["--replay", "{files}/walker.npz"], ["walker.npz", "(24, 6)", "(8, 3)"]),
     (["--replay", "{files}/expert.npz"], ["expert.npz", "kind", "'expert'"]),
     (["--expert", "{files}/replay.npz"], ["replay.npz", "kind", "'replay'"]),
+    (["--expert", "{files}/spoilt.npz"], ["spoilt.json", "record anew"]),  # before it distils
     (["--out", "{files}/corrupt.npz"], ["corrupt.npz", "can't be read or written"]),
     (["--out", "{files}/corrupt.npz/below"], ["corrupt.npz", "can't be read or written"]),
 ])
