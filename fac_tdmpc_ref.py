@@ -1731,11 +1731,12 @@ def command_distill(args):
         **preset(PlannerConfig), **made_for(header, path), "horizon": config.horizon})
     out = Path(args.out or f"runs/{args.task}-{args.seed}")
     out.mkdir(parents=True, exist_ok=True)
+    record = read_records(path).get(record_key(expert, planning, args.eval_seed), [])
     with contextlib.closing(Distiller(expert, replay, config, args.num_agents,
                                       args.seed)) as distiller:
         result = distil_and_save(distiller, args, planning, header, out)
     obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
-    result.update(evaluate_both(expert, path, distiller.student, args, planning))
+    result.update(evaluate_both(expert, record, distiller.student, args, planning))
     result.update(time_both(expert, distiller.student, planning, obs))
     result["seconds_total"] = round(time.time() - began, 1)
     write_json(out / "result.json", result)
@@ -1755,7 +1756,7 @@ def load_data(args):
         need(header.get(key) == expected, f"{path}: header: {key}: expected {expected!r}, found "
              f"{header.get(key)!r}")
     check_task(expert.config, args.task)
-    Environment(args.task), read_records(path)  # what is missing is missed now
+    Environment(args.task)  # what is missing is missed now, not after the last step
     replay = Replay(args.replay or path.with_name("replay.npz"))
     return expert, header, replay, path
 
@@ -1785,21 +1786,19 @@ def distil_and_save(distiller, args, planning, header, out):
             "picture": draw_curve(out / "curve.png", curve, f"{args.task}, seed {args.seed}")}
 
 
-def evaluate_both(expert, path, student, args, planning):
-    """The student's returns and the expert's, recorded or measured: result's part."""
+def evaluate_both(expert, record, student, args, planning):
+    """The student's returns and the expert's, from its record or measured: result's part."""
     where = args.episodes, args.eval_seed, args.workers
-    returns = {"student": evaluate(student, args.task, planning, *where, "evaluating the student"
-                                   )["returns"]}
-    record = read_records(path).get(record_key(expert, planning, args.eval_seed), [])
+    students = evaluate(student, args.task, planning, *where, "evaluating the student")["returns"]
     recorded = len(record) >= args.episodes and not args.evaluate_expert
-    returns["expert"] = record[:args.episodes] if recorded else evaluate(
+    experts = record[:args.episodes] if recorded else evaluate(
         expert, args.task, planning, *where, "evaluating the expert")["returns"]
-    mean = {who: float(np.mean(x)) for who, x in returns.items()}
     return {"episodes": args.episodes, "expert_recorded": recorded,
-            "kept": return_kept(mean["student"], mean["expert"]),
-            **{f"{who}_return_mean": x for who, x in mean.items()},
-            **{f"{who}_return_std": float(np.std(x)) for who, x in returns.items()},
-            **{f"{who}_returns": x for who, x in returns.items()}}
+            "expert_return_mean": float(np.mean(experts)),
+            "expert_return_std": float(np.std(experts)), "expert_returns": experts,
+            "student_return_mean": float(np.mean(students)),
+            "student_return_std": float(np.std(students)), "student_returns": students,
+            "kept": return_kept(np.mean(students), np.mean(experts))}
 
 
 def time_both(expert, student, planning, obs):

@@ -126,6 +126,8 @@ def run_all(args, function, runs):
     """function(task, seed, case, settings), rows, of all runs that the CSV doesn't hold; result."""
     with fac.optional("joblib", "experiments"):
         import joblib
+    for task in args.tasks:
+        fac.lookup_task(task)
     path = Path(args.out or RESULTS / f"{args.command}.csv")
     done, failed, where = finished(read_rows(path)), [], connect(args)
     runs = unique(runs)
@@ -234,11 +236,9 @@ class ConsistentDistiller(fac.Distiller):
         return features, actions, [*targets, after.T.reshape(steps, *columns, -1)]
 
 
-class SmallDistiller(fac.Distiller):
+def small_distiller(expert, replay, config, _, seed):
     """B.2's 10% TD-MPC: centralized, hidden layers of 66 (3% of the weights behind the encoder)."""
-
-    def __init__(self, expert, replay, config, num_agents=1, seed=0):
-        super().__init__(expert, replay, config, 1, seed, mlp_dim=66)
+    return fac.Distiller(expert, replay, config, 1, seed, mlp_dim=66)
 
 
 def distiller_of(case):
@@ -247,7 +247,7 @@ def distiller_of(case):
         from tap import TapDistiller
         return TapDistiller
     return {"MSE": MSEDistiller, "consistency": ConsistentDistiller,
-            "10% TD-MPC": SmallDistiller}.get(case, fac.Distiller)
+            "10% TD-MPC": small_distiller}.get(case, fac.Distiller)
 
 
 def distil(task, seed, case, settings):
@@ -496,8 +496,6 @@ def follow(task, seed, case, settings):
 def command_figure12(args):
     """figure12: online distillation (C.1)."""
     fac.need(args.decisions % 2000 == 0, f"--decisions: a multiple of 2000, not {args.decisions}")
-    for task in args.tasks:
-        fac.lookup_task(task)
     return run_all(args, follow, [
         make_run(task, seed, "online", decisions=args.decisions, episodes=args.episodes)
         for seed, task in itertools.product(args.seeds, args.tasks)])
