@@ -1573,8 +1573,9 @@ CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correla
 def train_student(distiller, out, settings, playing, workers):
     """Algorithm 1 to its end, with a learning curve and checkpoints in the folder `out`.
 
-    A run that was cut off goes on from its checkpoint and ends as if it had not been. Returns
-    (curve rows, seconds). playing, workers: how the student plays its own episodes [D8]."""
+    A run that was cut off goes on from its checkpoint and ends as if it had not been, one that is
+    over makes no step. Returns (curve rows, seconds). playing, workers: how the student plays its
+    own episodes [D8]."""
     def play_own(first, count):
         seeds = training_seeds(distiller.seed, "own episode", first, count)
         return play(distiller.student, settings["task"], playing, seeds, workers,
@@ -1740,7 +1741,6 @@ def command_distill(args):
     result.update(time_both(expert, distiller.student, planning, obs))
     result["seconds_total"] = round(time.time() - began, 1)
     write_json(out / "result.json", result)
-    (out / "checkpoint.npz").unlink(missing_ok=True)
     report(result, planning, args.eval_seed)
     return result
 
@@ -1937,7 +1937,8 @@ def make_parser():
 
     sub = add_command(commands, "distill", command_distill, "Distil a task's expert into a "
                       "factored student (Algorithm 1), then evaluate and time both with MPPI.",
-                      epilog="A run that was cut off goes on when the same command is given again.")
+                      epilog="Given again, a run that was cut off goes on; one that is over is "
+                      "evaluated.")
     add = sub.add_argument
     add("--task", default="reacher-hard", help="one of: " + ", ".join(TASKS))
     add("--seed", type=natural, default=0, help="of distillation [0]")

@@ -435,7 +435,7 @@ def test_distill_writes_its_results_and_nothing_else(distilled):
     done, folder = distilled
     pictures = ["curve.png"] if importlib.util.find_spec("matplotlib") else []
     assert sorted(os.listdir(folder)) == sorted(
-        ["config.json", "curve.csv", "result.json", "student.npz", *pictures])
+        ["checkpoint.npz", "config.json", "curve.csv", "result.json", "student.npz", *pictures])
     assert os.listdir(folder.parents[1]) == ["runs"]
     assert json.loads((folder / "result.json").read_text()) == last_json(done)
 
@@ -536,7 +536,10 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(killed, distilled):
     assert student_of(out) == student_of(distilled[1])
     assert rows_without_seconds(out / "curve.csv") == rows_without_seconds(
         distilled[1] / "curve.csv")
-    assert not (out / "checkpoint.npz").exists() and (out / "result.json").exists()
+    assert (out / "result.json").exists()
+    before = student_of(out), (out / "curve.csv").read_bytes()
+    succeeded(distill("--episodes", "2", stop=0))  # it is over: nothing begins again
+    assert (student_of(out), (out / "curve.csv").read_bytes()) == before
 
 
 def test_a_killed_run_whose_student_plays_goes_on(tmp_path, files, no_plots):
