@@ -1631,7 +1631,7 @@ def same_settings(found, expected, where):
             same_settings(*values, where)
         else:
             need(values[0] == values[1], f"{where}: a run with other settings ({key}: expected "
-                 f"{values[1]}, found {values[0]}); delete it, or choose another --out")
+                 f"{values[1]}, found {values[0]}); choose another --out, or empty this one")
 
 
 def write_curve(path, columns, rows):

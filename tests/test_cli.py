@@ -155,17 +155,6 @@ def test_help_is_quick_and_starts_nothing(tmp_path, command, expected):
     assert os.listdir(tmp_path) == []
 
 
-def test_every_setting_has_a_flag_in_help():
-    subparsers = fac.make_parser()._subparsers._group_actions[0].choices
-    for command, config_class, prefix in (("distill", fac.DistillConfig, ""),
-                                          ("distill", fac.PlannerConfig, "plan-"),
-                                          ("evaluate", fac.PlannerConfig, "")):
-        text = subparsers[command].format_help()
-        for f in dataclasses.fields(config_class):
-            name = f.name if f.name == "horizon" else prefix + f.name
-            assert f"--{name}".replace("_", "-") in text
-
-
 # configuration ------------------------------------------------------------------------
 
 
@@ -268,35 +257,17 @@ def refused(done, *parts, program="fac_tdmpc_ref.py"):
     (["--task", "reacher-hart"], ["did you mean 'reacher-hard'", *fac.TASKS]),
     (["--task", "walker-walk"], ["expert.npz", "task", "'walker-walk'", "'reacher-hard'"]),
     (["--num-agents", "2"], ["num_agents", "[1, 3]", "not 2"]),
-    (["--num-agents", "0"], ["agents", "[1, 3]", "0"]),
-    (["--num-agents", "-3"], ["agents", "[1, 3]", "-3"]),
     (["--steps", "0"], ["steps", "at least 1", "0"]),
-    (["--batch-size", "1"], ["batch_size", "at least 2"]),
-    (["--horizon", "-1"], ["horizon", "at least 0"]),
-    (["--horizon", "500"], ["horizon", "at most 499"]),
     (["--batch-size", "9" * 23], ["batch_size", "at least 2 and at most 10^9"]),
-    (["--noise-samples", "1"], ["noise_samples", "at least 2"]),
     (["--noise-std", "nan"], ["noise_std", "nan"]),
-    (["--noise-std", "inf"], ["noise_std", "finite"]),
-    (["--lr", "0"], ["lr", "above 0"]),
     (["--lr", "inf"], ["lr", "finite"]),
-    (["--lam", "inf"], ["lam", "finite"]),
     (["--own-episodes", "1", "--own-share", "0"], ["own_share", "above 0", "not 0.0"]),
     (["--held-out", "1"], ["held_out", "at least 0.0001 and at most 0.5"]),
     (["--held-out", "0.05"], ["replay.npz", "6 episodes are too few"]),
     (["--kl", "sideways"], ["--kl", "'sideways'", "forward"]),
-    (["--preset", "authors"], ["--preset", "'authors'", "paper"]),
-    (["--plan-elites", "17"], ["elites", "samples (16)", "not 17"]),
     (["--plan-horizon", "0"], ["--plan-horizon"]),
-    (["--plan-samples", "0"], ["samples", "at least 1"]),
-    (["--plan-pi-trajs", "-1"], ["pi_trajs", "-1"]),
     (["--plan-min-std", "3"], ["min_std", "max_std"]),
-    (["--plan-max-std", "inf"], ["max_std", "finite"]),
-    (["--plan-inverse-temperature", "inf"], ["temperature", "finite"]),
-    (["--plan-discount", "1.1"], ["discount", "at most 1"]),
-    (["--plan-momentum", "5"], ["momentum", "at most 1"]),
     (["--episodes", "0"], ["episodes", "at least 1"]),
-    (["--workers", "-1"], ["--workers", "-1"]),
     (["--seed", "-1"], ["--seed", "-1"]),
     (["--eval-seed", "x"], ["--eval-seed", "'x'"]),
     (["--stepz", "3"], ["--stepz"]),
@@ -343,11 +314,8 @@ def test_what_diverges_is_refused_and_leaves_no_weights(tmp_path, files, steps):
     (["evaluate", "--model", "{files}/expert.npz", "--task", "reacher-heart"],
      ["did you mean 'reacher-hard'", *fac.TASKS]),
     (["evaluate", "--model", "{files}/expert.npz", "--task", "hopper-hop"], ["(8, 3)", "(15, 4)"]),
-    (["evaluate", "--model", "{files}/expert.npz", "--episodes", "0"], ["episodes", "at least 1"]),
     (["evaluate", "--model", "{files}/expert.npz", "--samples", "8", "--elites", "9"],
      ["elites", "samples (8)", "not 9"]),
-    (["evaluate", "--model", "{files}/expert.npz", "--seed", "-1"], ["--seed", "-1"]),
-    (["evaluate", "--model", "{files}/expert.npz", "--output", "best"], ["'best'", "sampled"]),
 ])
 def test_other_bad_commands_are_refused(tmp_path, files, arguments, parts):
     refused(run(*(a.format(files=files) for a in arguments), cwd=tmp_path), *parts)

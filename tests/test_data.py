@@ -502,32 +502,6 @@ def test_a_writer_that_fails_changes_nothing(old_file, error):
     assert untouched(old_file)
 
 
-def test_a_full_disk_is_reported_and_changes_nothing(old_file):
-    def write():
-        with fac.atomic_file(old_file) as file:
-            file.write(b"half")
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    refusal(write, old_file, "can't be written", "No space left on device")
-    assert untouched(old_file)
-
-
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="only Linux has a disk that is full")
-def test_write_npz_on_a_device_that_is_full(old_file, monkeypatch):
-    """The same with a real ENOSPC out of NumPy's own writing."""
-    fdopen = os.fdopen
-
-    def on_full_disk(handle, mode, **options):
-        os.dup2(os.open("/dev/full", os.O_WRONLY), handle)
-        return fdopen(handle, mode, **options)
-
-    monkeypatch.setattr(fac.os, "fdopen", on_full_disk)
-    refusal(lambda: fac.write_npz(old_file, {}, {"a": np.zeros(100_000)}), old_file,
-            "can't be written")
-    monkeypatch.undo()
-    assert untouched(old_file)
-
-
 @pytest.mark.parametrize("name", ["mkstemp", "replace"])
 def test_a_folder_that_can_not_be_written(old_file, monkeypatch, name):
     """Read-only, as the system would say it: permissions don't bind the superuser."""

@@ -1,6 +1,7 @@
 """data/experiments.py: the paper's tables as users run them, small."""
 import contextlib
 import dataclasses
+import functools
 import importlib.util
 import json
 import os
@@ -18,21 +19,17 @@ import fac_tdmpc_ref as fac
 import look
 import speed
 import tap
+import test_cli
 import train_expert
 from test_cli import BLOCKED, ONE_THREAD, ROOT, last_json, launch, write_expert
+from test_layers import assert_close, numeric_gradient
 from test_planning import random_model
+
+refused = functools.partial(test_cli.refused, program="experiments.py")
 
 
 def run(*arguments, cwd, env=ONE_THREAD):
     return launch([ROOT / "data" / "experiments.py", *arguments], cwd, env)
-
-
-def refused(done, *parts):
-    """Status 2, nothing on stdout, one line on stderr that holds `parts`."""
-    assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1, done.stderr
-    assert done.stderr.startswith("experiments.py") and ": error: " in done.stderr
-    for part in parts:
-        assert part in done.stderr
 
 
 @pytest.mark.parametrize("flags, parts", [
@@ -312,21 +309,6 @@ def loss_inputs(dtype=np.float64):
             [*targets, rng.standard_normal((3, 4, 3, 4))])
 
 
-def slopes(loss, params, grads):
-    """(central difference, gradient) of a few entries of every parameter."""
-    rng = np.random.default_rng(1)
-    for key in grads:
-        for _ in range(3):
-            i = tuple(rng.integers(n) for n in params[key].shape)
-            old = params[key][i]
-            values = []
-            for step in (1e-6, -1e-6):
-                params[key][i] = old + step
-                values.append(loss())
-            params[key][i] = old
-            yield (values[0] - values[1]) / 2e-6, grads[key][i]
-
-
 @pytest.mark.parametrize("kind", [experiments.MSEDistiller, experiments.ConsistentDistiller])
 def test_gradients_of_the_other_losses(kind, monkeypatch):
     student, features, actions, targets = loss_inputs()
@@ -339,9 +321,9 @@ def test_gradients_of_the_other_losses(kind, monkeypatch):
     fixed = goal is not None and encode(goal)
     monkeypatch.setattr(student, "encode_features", lambda x, tape=None: fixed
                         if x.shape[-1] == 36 else encode(x, tape))
-    for numeric, exact in slopes(lambda: kind.loss(student, features, actions, targets, config)[0],
-                                 student.params, grads):
-        np.testing.assert_allclose(exact, numeric, rtol=1e-5, atol=1e-8)
+    for key in grads:
+        assert_close(grads[key], numeric_gradient(lambda: kind.loss(
+            student, features, actions, targets, config)[0], student.params[key]), 1e-5)
 
 
 def test_a_figure12_run_counts_as_finished_by_its_last_row_alone(tmp_path, monkeypatch):
@@ -385,8 +367,8 @@ def test_gradients_of_the_action_vae():
     x, noise = rng.uniform(-1, 1, (7, 5)), rng.standard_normal((2, 5))
     grads = {k: np.zeros_like(v) for k, v in vae.params.items()}
     vae.loss(x, noise, 0.3, grads)
-    for numeric, exact in slopes(lambda: vae.loss(x, noise, 0.3), vae.params, grads):
-        np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-9)
+    for key, p in vae.params.items():
+        assert_close(grads[key], numeric_gradient(lambda: vae.loss(x, noise, 0.3), p), 1e-6)
 
 
 def test_the_action_vae_against_pytorch():
@@ -498,14 +480,6 @@ def test_departures_are_those_that_the_settings_name(monkeypatch):
     own = set(found["default"])
     assert {k: v for k, v in found["D7"].items() if k not in own} == {"clip_actions": False}
     assert found["D2"]["kl"] == "reverse" and found["D8"]["own_episodes"] == 0
-
-
-def test_the_cases_of_figure_5_learn_what_they_say():
-    kinds = {case: experiments.distiller_of(case) for panel in experiments.FIGURE5.values()
-             for case in panel}
-    assert kinds.pop("MSE") is experiments.MSEDistiller
-    assert kinds.pop("consistency") is experiments.ConsistentDistiller
-    assert set(kinds.values()) == {fac.Distiller} and len(kinds) == 6
 
 
 @pytest.mark.parametrize("seeds", [(0, 0), (0, 1)])

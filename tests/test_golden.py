@@ -188,17 +188,6 @@ def narrow_expert(header, g, prefix):
         for k, v in g.items() if k.startswith(prefix)})
 
 
-def test_narrow_expert_forward():
-    header, g = fac.read_npz(NARROW, ("golden",))
-    model = narrow_expert(header, g, "model ")
-    z = model.encode(g["obs"][0])
-    a = g["action"][0][None]
-    q1, q2 = model.q(z, a)
-    for name, found in (("latent", z), ("next_latent", model.next(z, a)), ("q1", q1), ("q2", q2),
-                        ("reward", model.reward(z, a)), ("policy", model.policy(z))):
-        assert relative(found[0], g[name]) < FORWARD, name
-
-
 # ------------------------------------------------------- PyTorch itself, on the same inputs
 
 @pytest.fixture

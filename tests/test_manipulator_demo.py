@@ -15,8 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -36,6 +34,7 @@ def reachable_points(count, seed=0):
     """Points spread evenly over the ring that the links reach, 5 to 35 from the base: (2, S)."""
     rng = np.random.default_rng(seed)
     radius, angle = np.sqrt(rng.uniform(5**2, 35**2, count)), rng.uniform(0, 2 * np.pi, count)
+    radius[:2] = 5, 35
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)])
 
 
@@ -66,14 +65,6 @@ def test_levers_are_the_jacobian():
         ahead, behind = (demo.forward_kinematics(theta + s) for s in (shift, -shift))
         column = (ahead - behind) / (2 * step)
         np.testing.assert_allclose(column, [-lever[1, joint], lever[0, joint]], atol=1e-7)
-
-
-@settings(max_examples=200, deadline=None)
-@given(st.floats(5, 35), st.floats(0, 2 * np.pi))
-def test_closed_form_round_trip(radius, angle):
-    xy = radius * np.array([[np.cos(angle)], [np.sin(angle)]])
-    theta = demo.closed_form_kinematics(xy)
-    np.testing.assert_allclose(demo.forward_kinematics(theta), xy, atol=35e-6)
 
 
 def test_round_trips_over_the_disc():
@@ -192,18 +183,6 @@ def test_return_is_the_discounted_sum_of_reached_rewards(discount):
                 angle += min(max(command - angle, -0.01), 0.01)
                 expected -= discount**h * (angle - demo.GOAL_ANGLES[joint]) ** 2
             assert returns[joint, sample] == pytest.approx(expected, rel=1e-12)
-
-
-def test_discount_zero_scores_the_first_action_only():
-    model, state = demo.JointModel(), demo.START_ANGLES[:, None]
-    actions = np.random.default_rng(0).uniform(-1, 1, (3, 4, 1, 20))
-    other = actions.copy()
-    other[:, 1:] *= -1
-    same = demo.imagined_return(model, state, actions, 0.0)
-    np.testing.assert_array_equal(same, demo.imagined_return(model, state, other, 0.0))
-    assert np.ptp(same, axis=1).min() > 0  # and the first action does matter
-    assert (demo.imagined_return(model, state, actions, 1.0)
-            != demo.imagined_return(model, state, other, 1.0)).any()
 
 
 def test_what_is_planned_with_and_what_is_kept(monkeypatch):

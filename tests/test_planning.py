@@ -184,10 +184,8 @@ def test_an_observation_of_the_wrong_size_is_refused():
 
 
 def test_planner_config_refuses_nonsense():
-    for wrong, text in (({"elites": 9, "samples": 8}, "elites"), ({"horizon": -1}, "horizon"),
-                        ({"min_std": 3.0}, "min_std"), ({"output": "best"}, "output"),
-                        ({"inverse_temperature": np.inf}, "finite"),
-                        ({"max_std": np.inf}, "finite"), ({"momentum": np.nan}, "momentum"),
+    for wrong, text in (({"elites": 9, "samples": 8}, r"elites must be at most samples \(8\)"),
+                        ({"min_std": 3.0}, r"min_std must be at most max_std \(2.0\)"),
                         ({"discount": 1.1}, "at least 0 and at most 1")):
         with pytest.raises(fac.UserError, match=text):
             fac.PlannerConfig(**wrong)
@@ -254,9 +252,10 @@ def test_a_dead_worker_is_reported_and_nothing_hangs():
         processes = [process for process, _ in planner._workers._members]
         os.kill(processes[0].pid, signal.SIGKILL)
         began = time.monotonic()
-        with pytest.raises(fac.WorkerError, match="worker 0 ended with exit code -9"):
-            for _ in range(3):
-                planner.act(np.zeros(8))
+        for message in ("worker 0 ended with exit code -9", "worker 0 was stopped before"):
+            with pytest.raises(fac.WorkerError, match=message):
+                for _ in range(3):
+                    planner.act(np.zeros(8))
         assert time.monotonic() - began < 5  # a hang would last for ever
         assert not any(process.is_alive() for process in processes)
 
@@ -430,15 +429,6 @@ def test_without_a_seed_every_planner_is_another():
     plans = [fac.Planner(random_model(), fac.PlannerConfig(samples=16), seed=None).act(np.zeros(8))
              for _ in range(2)]
     assert not np.array_equal(*plans)
-
-
-def test_after_a_dead_worker_the_planner_says_so_again():
-    with fac.Planner(random_model(), fac.PlannerConfig(samples=16), workers=1) as planner:
-        os.kill(planner._workers._members[0][0].pid, signal.SIGKILL)
-        for message in ("ended with exit code -9", "was stopped before", "was stopped before"):
-            with pytest.raises(fac.WorkerError, match=message):
-                for _ in range(3):
-                    planner.act(np.zeros(8))
 
 
 def test_cores_are_those_this_process_may_use(monkeypatch):

@@ -227,22 +227,13 @@ def test_another_run_s_files_are_not_replaced(tmp_path, name):
     (["--precision", "bfloat16"], ["--precision needs --backend torch"]),
     (["--threads", "2"], ["--threads needs --backend torch"]),
     (["--envs", "0"], ["envs", "at least 1"]),
-    (["--workers", "0"], ["workers", "at least 1"]),
-    (["--lr", "0"], ["lr", "above 0"]),
-    (["--lr", "inf"], ["lr", "finite"]),
-    (["--updates-per-step", "nan"], ["updates_per_step", "nan"]),
     (["--minutes", "nan"], ["--minutes", "nan"]),
-    (["--mlp-dim", "0"], ["mlp_dim", "at least 1"]),
     (["--num-agents", "2"], ["[1, 3]"]),
-    (["--num-agents", "0"], ["[1, 3]"]),
-    (["--horizon", "501"], ["horizon", "500"]),
-    (["--updates-per-step", "inf"], ["updates_per_step", "finite"]),
     (["--std-start", "3"], ["std_start", "2.0"]),
     (["--distill-batch-size", "3"], ["--distill-batch-size"]),
     (["--out", fac.__file__], ["can't be read or written"]),
     (["--out", "x" * 300], ["can't be read or written"]),
     (["--evaluate-every", "0"], ["evaluate"]),
-    (["--evaluate-episodes", "0"], ["evaluate"]),
     (["--episodes", "-1"], ["--episodes"]),
 ])
 def test_train_refuses(tmp_path, flags, parts):
@@ -416,7 +407,3 @@ def test_tests_beside_the_training_are_an_evaluation():
     assert returns == fac.evaluate(model, "reacher-easy", planning, 2, 0, 0)["returns"]
 
 
-def test_a_bad_rendering_setting_is_explained(tmp_path):
-    done = launch([SCRIPT, *SMALL], tmp_path, {**ONE_THREAD, "MUJOCO_GL": "nonsense"})
-    assert done.returncode == 2 and "Traceback" not in done.stderr, done.stderr
-    assert "MUJOCO_GL" in done.stderr.splitlines()[-1] and "'nonsense'" in done.stderr
