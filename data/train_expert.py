@@ -174,10 +174,12 @@ class ReplayBuffer:
         return obs.swapaxes(1, 2), action.swapaxes(1, 2), reward, (episode, start)
 
     def write(self, path, header, episodes=0):
-        """A file for `Replay` with the newest `episodes` (0: all that are held), oldest first; an
+        """A file for `Replay` with `episodes` (0: all that are held), oldest first, spread evenly
+        over training: the newest alone don't show a student what to do once it has fallen. An
         episode's last row has no action. header names the task, for `spread_targets`."""
         held = np.arange(self.count - len(self), self.count) % len(self.reward)
-        order = held[-episodes:]
+        count = min(episodes or len(held), len(held))
+        order = held[::-1][np.arange(count) * len(held) // count][::-1]
         action = np.zeros((len(order), fac.EPISODE_STEPS + 1, self.action.shape[2]), np.float16)
         action[:, :-1] = self.action[order]
         continues = np.ones(action.shape[:2], bool)
@@ -615,8 +617,8 @@ def make_parser():
     add("--out", help="folder for the results [runs/train-TASK-SEED]")
     add("--episodes", type=natural, default=20, help="evaluation episodes at the end, with MPPI's "
         "default budget; 0: none [20]")
-    add("--replay", type=natural, default=100_000, help="transitions in replay.npz, the newest "
-        "[100000]")
+    add("--replay", type=natural, default=100_000, help="transitions in replay.npz, of "
+        "episodes spread evenly over training [100000]")
     add("--evaluate-every", type=positive, default=4_000, help="decisions between two evaluations "
         "on the way [4000]")
     add("--evaluate-episodes", type=positive, default=10, help="episodes in one [10]")

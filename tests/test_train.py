@@ -55,6 +55,14 @@ def test_the_buffer_drops_the_oldest_and_writes_a_replay(tmp_path, dtype):
     assert set(fac.Replay(tmp_path / "replay.npz").observation[:, 0]) == {3}  # the newest
 
 
+def test_a_replay_is_spread_over_training(tmp_path):
+    buffer = train_expert.ReplayBuffer(8, 3, 10 * fac.EPISODE_STEPS)
+    for value in range(10):
+        buffer.add(*episode(np.random.default_rng(0), value))
+    buffer.write(tmp_path / "replay.npz", {"task": "walker-walk"}, episodes=3)
+    assert fac.Replay(tmp_path / "replay.npz").observation[::501, 0].tolist() == [3, 6, 9]
+
+
 def test_half_of_a_reacher_replay_s_states_get_another_target():
     rng = np.random.default_rng(0)
     before = rng.standard_normal((4000, 8)).astype(np.float16)
