@@ -257,6 +257,8 @@ def refused(done, *parts, program="fac_tdmpc_ref.py"):
     (["--task", "reacher-hart"], ["did you mean 'reacher-hard'", *fac.TASKS]),
     (["--task", "walker-walk"], ["expert.npz", "task", "'walker-walk'", "'reacher-hard'"]),
     (["--num-agents", "2"], ["num_agents", "[1, 3]", "not 2"]),
+    (["--num-agents", "0"], ["agents", "[1, 3]", "0"]),
+    (["--num-agents", "-3"], ["agents", "[1, 3]", "-3"]),
     (["--steps", "0"], ["steps", "at least 1", "0"]),
     (["--batch-size", "9" * 23], ["batch_size", "at least 2 and at most 10^9"]),
     (["--noise-std", "nan"], ["noise_std", "nan"]),
@@ -268,6 +270,7 @@ def refused(done, *parts, program="fac_tdmpc_ref.py"):
     (["--plan-horizon", "0"], ["--plan-horizon"]),
     (["--plan-min-std", "3"], ["min_std", "max_std"]),
     (["--episodes", "0"], ["episodes", "at least 1"]),
+    (["--workers", "-1"], ["--workers", "-1"]),
     (["--seed", "-1"], ["--seed", "-1"]),
     (["--eval-seed", "x"], ["--eval-seed", "'x'"]),
     (["--stepz", "3"], ["--stepz"]),
@@ -314,8 +317,10 @@ def test_what_diverges_is_refused_and_leaves_no_weights(tmp_path, files, steps):
     (["evaluate", "--model", "{files}/expert.npz", "--task", "reacher-heart"],
      ["did you mean 'reacher-hard'", *fac.TASKS]),
     (["evaluate", "--model", "{files}/expert.npz", "--task", "hopper-hop"], ["(8, 3)", "(15, 4)"]),
+    (["evaluate", "--model", "{files}/expert.npz", "--episodes", "0"], ["episodes", "at least 1"]),
     (["evaluate", "--model", "{files}/expert.npz", "--samples", "8", "--elites", "9"],
      ["elites", "samples (8)", "not 9"]),
+    (["evaluate", "--model", "{files}/expert.npz", "--seed", "-1"], ["--seed", "-1"]),
 ])
 def test_other_bad_commands_are_refused(tmp_path, files, arguments, parts):
     refused(run(*(a.format(files=files) for a in arguments), cwd=tmp_path), *parts)

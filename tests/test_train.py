@@ -235,13 +235,16 @@ def test_another_run_s_files_are_not_replaced(tmp_path, name):
     (["--precision", "bfloat16"], ["--precision needs --backend torch"]),
     (["--threads", "2"], ["--threads needs --backend torch"]),
     (["--envs", "0"], ["envs", "at least 1"]),
+    (["--workers", "0"], ["workers", "at least 1"]),
     (["--minutes", "nan"], ["--minutes", "nan"]),
     (["--num-agents", "2"], ["[1, 3]"]),
+    (["--num-agents", "0"], ["[1, 3]"]),
     (["--std-start", "3"], ["std_start", "2.0"]),
     (["--distill-batch-size", "3"], ["--distill-batch-size"]),
     (["--out", fac.__file__], ["can't be read or written"]),
     (["--out", "x" * 300], ["can't be read or written"]),
     (["--evaluate-every", "0"], ["evaluate"]),
+    (["--evaluate-episodes", "0"], ["evaluate"]),
     (["--episodes", "-1"], ["--episodes"]),
 ])
 def test_train_refuses(tmp_path, flags, parts):
@@ -413,5 +416,3 @@ def test_tests_beside_the_training_are_an_evaluation():
     finally:
         actors.close()
     assert returns == fac.evaluate(model, "reacher-easy", planning, 2, 0, 0)["returns"]
-
-
