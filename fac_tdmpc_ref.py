@@ -656,6 +656,14 @@ def perturbed_batch(expert, student, obs, actions, config, rng):
     return features, perturbed, predict(expert, z, perturbed)
 
 
+def own_actions(expert, obs, played, copies, rng):
+    """Actions (L, A, B, K) to perturb in states obs (O, B) of the student's own [D8].
+
+    A coin for each of K copies: what the policy would do there, or what the student `played`."""
+    pi = policy_rollout(expert, expert.encode(obs), [F32(0)] * len(played))[:, 0]
+    return np.where(rng.random((len(obs.T), copies)) < 0.5, pi[..., None], played[..., None])
+
+
 POOL, PART = 4096, 256  # states that the expert predicts at once, and a thread's part of them
 OWN_BUDGET = {"samples": 64, "iterations": 3, "elites": 0}  # MPPI's in own episodes [D8]
 
@@ -703,10 +711,8 @@ class Distiller:
             t = rng.integers(EPISODE_STEPS - L + 1, size=count) + np.arange(L)[:, None]
             played = self.own[episode, t].swapaxes(1, 2).astype(F32)  # (L, O + A, count)
             obs[:, is_own] = played[0, :dim_obs]
-            pi = policy_rollout(self.expert, self.expert.encode(obs[:, is_own]), [F32(0)] * L)[:, 0]
-            # a coin for each copy: what the policy would do, or what the student did
-            actions[:, :, is_own] = np.where(rng.random((count, K)) < 0.5, pi[..., None],
-                                             played[:, dim_obs:, :, None])
+            actions[:, :, is_own] = own_actions(self.expert, played[0, :dim_obs],
+                                                played[:, dim_obs:], K, rng)
         return perturbed_batch(self.expert, self.student, obs, actions, self.config, rng)
 
     def batch(self, t):

@@ -156,11 +156,11 @@ class Learner:
         restore("policy", self.policy_optimizer, arrays)
 
 
-def named(name, optimizer):
-    """The state of a fac.Adam under its name."""
-    return {f"{name} {key}": value for key, value in optimizer.state().items()}
+def named(name, what):
+    """The state of a fac.Adam, or what else has one, under its name."""
+    return {f"{name} {key}": value for key, value in what.state().items()}
 
 
-def restore(name, optimizer, arrays):
-    """Give a fac.Adam the state that `named` has put into arrays."""
-    optimizer.load({key: arrays[f"{name} {key}"] for key in optimizer.state()})
+def restore(name, what, arrays):
+    """Give it the state that `named` has put into arrays."""
+    what.load({key: arrays[f"{name} {key}"] for key in what.state()})

@@ -30,8 +30,8 @@ from numpy_learner import ExpertConfig, Learner, named, restore  # noqa: E402
 # for a few cores; hidden layers of 512, as in Table 2, make an update three times as dear
 TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
 # settings of distill that say nothing where an expert still learns
-NOT_ONLINE = ("steps", "batch_size", "reuse", "own_episodes", "own_share", "held_out")
-FOLLOWING_DEFAULTS = {"noise_samples": 3}
+NOT_ONLINE = ("steps", "batch_size", "reuse", "own_episodes", "held_out")
+FOLLOWING_DEFAULTS = {"noise_samples": 3, "own_episodes": 0}  # a share of each round instead
 TORCH_ONLY = {"device": None, "precision": "float32", "threads": 1}  # and their defaults
 FINGER_RADIUS, REACHER_LINK = 0.01, 0.09  # of data/reacher.xml, metres
 LOSSES = ("consistency", "reward", "value", "kl_reward", "kl_value")
@@ -213,18 +213,29 @@ def make_learner(args, sizes, config):
 
 
 class OnlineStudent:
-    """Appendix C.1: Algorithm 1 on the batches, and with the expert, of a training that goes on."""
+    """Appendix C.1: Algorithm 1 on the batches, and with the expert, of a training that goes on.
 
-    def __init__(self, expert, num_agents, config, seed):
-        self.config, self.seed = config, seed
+    own: a ReplayBuffer of episodes that it played; once there are any, a share of its states is
+    from them [D8].
+    """
+
+    def __init__(self, expert, num_agents, config, seed, own):
+        self.config, self.seed, self.own = config, seed, own
         sizes = fac.student_config(expert.config, num_agents, config.sizes, config.encoder_input)
         self.optimizer, self.model = fac.new_student(expert, sizes, seed)
 
     def update(self, expert, obs, actions):
         """One step of Algorithm 1 on observations (O, B) and actions (H, A, B); its divergences."""
         config, t, L = self.config, self.optimizer.t, self.config.horizon + 1
-        batch = fac.perturbed_batch(expert, self.model, obs, actions[:L, ..., None], config,
-                                    fac.stream(self.seed, "perturbations", t))
+        rng = fac.stream(self.seed, "perturbations", t)
+        actions = np.repeat(actions[:L, ..., None], config.noise_samples, -1)
+        if len(self.own):
+            mine = slice(int(config.own_share * obs.shape[1]))
+            found, played, *_ = self.own.sample(rng, mine.stop, L)
+            obs[:, mine] = found[0]
+            actions[:, :, mine] = fac.own_actions(expert, found[0], played, config.noise_samples,
+                                                  rng)
+        batch = fac.perturbed_batch(expert, self.model, obs, actions, config, rng)
         _, *divergences = fac.distill_loss(self.model, *batch, config, self.optimizer.grads)
         self.optimizer.step(fac.learning_rate(config, t), config.grad_clip)
         return divergences
@@ -292,10 +303,10 @@ class Training:
         self.args, self.config, self.planning = args, config, planning
         self.learner = make_learner(args, fac.ModelConfig(
             dim_obs, dim_action, 1, config.latent_dim, config.enc_dim, config.mlp_dim), config)
+        self.buffer, own = (ReplayBuffer(dim_obs, dim_action, config.buffer_size,
+                                         np.dtype(config.buffer_dtype)) for _ in range(2))
         self.student = distilling and OnlineStudent(self.learner.model, args.num_agents,
-                                                    distilling, args.seed)
-        self.buffer = ReplayBuffer(dim_obs, dim_action, config.buffer_size,
-                                   np.dtype(config.buffer_dtype))
+                                                    distilling, args.seed, own)
         self.decisions, self.allowed, self.seconds, self.curve = 0, 0.0, 0.0, []
         self.settings = {key: getattr(args, key) for key in (
             "task", "seed", "backend", "envs", "refresh", "evaluate_every", "num_agents")}
@@ -324,19 +335,25 @@ class Training:
         horizon = np.interp(self.decisions, over, [1, self.planning.horizon])
         return {"exploration_std": float(std), "horizon": int(horizon)}
 
-    def explorer(self):
-        """The planner of training episodes, with the weights of now, as `Actors.play` takes it."""
+    def explorers(self):
+        """The planners of a round's episodes, with the weights of now, as `Actors.play` takes them.
+        """
         if self.warming:
             return {}
-        now = self.scheduled()
-        return {"explorer": (self.learner.model, dataclasses.replace(
-            self.planning, min_std=now["exploration_std"], horizon=now["horizon"]))}
+        _, planners = self.tests()
+        model, planning = planners["expert"]
+        planning = dataclasses.replace(planning, min_std=self.scheduled()["exploration_std"])
+        own = {"own": planners["student"]} if self.student else {}
+        return {"explorer": (model, planning), **own}
 
     def explorations(self):
-        """A round's training episodes, as `Actors.begin` takes them."""
-        seeds = fac.training_seeds(self.args.seed, "training episode",
-                                   self.decisions // fac.EPISODE_STEPS, self.args.envs)
-        return [(seed, "explorer", self.scheduled()["exploration_std"]) for seed in seeds]
+        """A round's training episodes, then the student's own, as `Actors.begin` takes them."""
+        first, std = self.decisions // fac.EPISODE_STEPS, self.scheduled()["exploration_std"]
+        share = self.student.config.own_share if self.student and not self.warming else 0
+        return [(seed, player, deviation) for use, player, deviation, count in (
+            ("training episode", "explorer", std, self.args.envs),
+            ("own episode", "own", 0.0, int(np.ceil(share * self.args.envs))))
+            for seed in fac.training_seeds(self.args.seed, use, first, count)]
 
     def tests(self):
         """An evaluation's episodes and planners, with the training's budget and horizon of now."""
@@ -378,22 +395,23 @@ class Training:
         warming, row = self.warming, {**dict.fromkeys(CURVE), **self.scheduled()}
         tested = self.curve and not warming and self.decisions % self.args.evaluate_every < quota
         tests, planners = self.tests() if tested else ([], {})
-        actors.begin(self.explorations() + tests)
+        playing = self.explorations()
+        actors.begin(playing + tests)
         losses, start = [], self.learner.updates
         due = 0 if warming else int(self.allowed) - start
         for played in range(0, fac.EPISODE_STEPS, self.args.refresh):
             end = min(played + self.args.refresh, fac.EPISODE_STEPS)
-            actors.play(end - played, {**planners, **self.explorer()})
+            actors.play(end - played, {**planners, **self.explorers()})
             losses += self.learn_until(start + due * end // fac.EPISODE_STEPS, bar)
             episodes, planners = actors.wait(), {}
-        for episode in episodes[:envs]:
-            self.buffer.add(*episode)
+        for (_, player, _), episode in zip(playing, episodes):
+            (self.student.own if player == "own" else self.buffer).add(*episode)
         self.decisions += quota
         if warming and not self.warming:  # one round's behind, as later
             losses = self.learn_until(int(self.allowed), bar)
         self.allowed += self.config.updates_per_step * quota
         self.seconds += time.time() - began
-        self.note(tests, episodes[envs:])
+        self.note(tests, episodes[len(playing):])
         returns = [float(reward.sum()) for *_, reward in episodes[:envs]]
         row.update(decisions=self.decisions, updates=self.learner.updates,
                    seconds=round(self.seconds, 1), return_mean=float(np.mean(returns)),
@@ -423,7 +441,8 @@ class Training:
         """Write the checkpoint and then, for it holds their rows, the curve."""
         learned = self.learner.state()
         if self.student:
-            learned.update(named("student", self.student.optimizer))
+            learned.update({**named("student", self.student.optimizer),
+                            **named("own", self.student.own)})
         for key, value in learned.items():
             fac.check_finite({f"weights ({key}) are": value}, self.learner.updates, self.config.lr)
         header = {key: getattr(self, key) for key in ("settings", "decisions", "allowed", "seconds",
@@ -442,6 +461,7 @@ class Training:
             self.learner.load(arrays)
             if self.student:
                 restore("student", self.student.optimizer, arrays)
+                restore("own", self.student.own, arrays)
             self.buffer.load(arrays)
             for key in ("decisions", "allowed", "seconds", "curve"):
                 setattr(self, key, header[key])
