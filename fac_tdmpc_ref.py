@@ -79,8 +79,7 @@ ACTION_REPEAT = 2  # control steps a decision; their rewards are added
 
 
 def field(default, help, **about):
-    """A dataclass field with its help, its range (`least`, `above`, `most`) or its `choices`, and,
-    where ours departs from it, the value of the `paper`."""
+    """A dataclass field; about: range (`least`, `above`, `most`), `choices`, `paper`'s value."""
     return dataclasses.field(default=default, metadata={"help": help, **about})
 
 
@@ -198,7 +197,8 @@ class DistillConfig(Settings):
                        choices=("table2", "section51"))
     own_episodes: int = field(16, "episodes that the student plays after each of the first three "
                               "quarters of the steps, to learn from [D8]", paper=0, least=0)
-    own_share: float = field(0.25, "share of states from these [D8]", paper=0.0, least=0, most=1)
+    own_share: float = field(0.25, "share of states from its own episodes [D8]", paper=0.0,
+                             least=0, most=1)
     held_out: float = field(0.05, "about this share of episodes is held out, for rank correlations",
                             least=1e-4, most=0.5)
 
@@ -418,9 +418,8 @@ class WorldModel:
     """f_E, f_T, f_R, f_Q with an agent axis: TD-MPC for N = 1, Fac-TDMPC for N = A.
 
     `params` maps official TD-MPC state-dict names to arrays with a leading agent axis, all of
-    one dtype (float32; float64 only to check gradients). The encoder is centralized (N = 1);
-    `_pi`, the expert's policy, and `_expert_encoder`, the frozen encoder below a student's own,
-    are there for some models only."""
+    one dtype (float32; float64 only to check gradients). The encoder is centralized (N = 1); only
+    experts have a policy, `_pi`, and only students an expert's frozen encoder below their own."""
 
     def __init__(self, config, params):
         self.config, self.params = config, params
@@ -657,9 +656,8 @@ def perturbed_batch(expert, student, obs, actions, config, rng):
 
 
 def own_actions(expert, obs, played, copies, rng):
-    """Actions (L, A, B, K) to perturb in states obs (O, B) of the student's own [D8].
-
-    A coin for each of K copies: what the policy would do there, or what the student `played`."""
+    """Actions (L, A, B, K) to perturb in the student's own states obs (O, B) [D8]: for each copy by
+    a coin what the expert's policy would do, or what the student `played` there (L, A, B)."""
     pi = policy_rollout(expert, expert.encode(obs), [F32(0)] * len(played))[:, 0]
     return np.where(rng.random((len(obs.T), copies)) < 0.5, pi[..., None], played[..., None])
 
@@ -709,10 +707,9 @@ class Distiller:
         if count := is_own.sum():
             episode = rng.integers(len(self.own), size=count)
             t = rng.integers(EPISODE_STEPS - L + 1, size=count) + np.arange(L)[:, None]
-            played = self.own[episode, t].swapaxes(1, 2).astype(F32)  # (L, O + A, count)
-            obs[:, is_own] = played[0, :dim_obs]
-            actions[:, :, is_own] = own_actions(self.expert, played[0, :dim_obs],
-                                                played[:, dim_obs:], K, rng)
+            seen, played = np.split(self.own[episode, t].swapaxes(1, 2).astype(F32), [dim_obs], 1)
+            obs[:, is_own] = seen[0]  # of (L, O, count)
+            actions[:, :, is_own] = own_actions(self.expert, seen[0], played, K, rng)
         return perturbed_batch(self.expert, self.student, obs, actions, self.config, rng)
 
     def batch(self, t):
@@ -798,8 +795,7 @@ def spearman(x, y):
 
 
 def horizon_returns(rewards, q1, q2, discount):
-    """Equation 2 for every H at once, from `predict`'s global rewards and Q: G^0, ..., G^H, all
-    (L, B, K), K sequences in each state."""
+    """Equation 2 for H = 0, 1, ... at once, (L, B, K), from `predict`'s global rewards and Q."""
     gamma = (discount ** np.arange(len(rewards))).astype(rewards.dtype)[:, None, None]
     return np.cumsum(gamma * rewards, 0) - gamma * rewards + gamma * (q1 + q2) / 2
 
@@ -977,8 +973,7 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
         return action.reshape(-1)
 
     def _add_up(self, G):
-        """Add up the returns (N, S) of all processes, zero where one rolled nothing out; each gets
-        those of its own agents back."""
+        """Add up all processes' returns (N, S), zero where one rolled nothing out, for each."""
         total = np.zeros((self.model.config.num_agents, G.shape[1]), F32)
         for part, found in zip(self._parts, [G, *self._workers.receive_all()]):
             total[part] += found
@@ -1579,9 +1574,8 @@ CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correla
 def train_student(distiller, out, settings, playing, workers):
     """Algorithm 1 to its end, with a learning curve and checkpoints in the folder `out`.
 
-    A run that was cut off goes on from its checkpoint and ends as if it had not been, one that is
-    over makes no step. Returns (curve rows, seconds). playing, workers: how the student plays its
-    own episodes [D8]."""
+    A run that was cut off goes on from its checkpoint and ends as if it had not been. Returns
+    (curve rows, seconds). playing, workers: how the student plays its own episodes [D8]."""
     def play_own(first, count):
         seeds = training_seeds(distiller.seed, "own episode", first, count)
         return play(distiller.student, settings["task"], playing, seeds, workers,

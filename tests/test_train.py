@@ -183,6 +183,40 @@ def test_train_prints_json_and_writes_what_distill_takes(trained, tmp_path):
     assert last_json(distilled)["steps"] == 3
 
 
+def test_the_student_plays_beside_the_expert(trained, tmp_path):
+    """An episode a round once it learns (two envs, a quarter, rounded up); none without a share."""
+    def played(folder):
+        header, arrays = fac.read_npz(folder / "checkpoint.npz", ("checkpoint",))
+        assert arrays["count"] == 6 and header["settings"]["distill"]["own_episodes"] == 0
+        assert arrays["own action"].shape == (arrays["own count"], fac.EPISODE_STEPS, 3)
+        return arrays["own count"]
+
+    assert played(trained[1]) == 2
+    succeeded(train("--distill-own-share", "0", "--out", "none", cwd=tmp_path))
+    assert played(tmp_path / "none") == 0
+
+
+def test_a_share_of_an_online_student_s_states_is_its_own(monkeypatch):
+    """There half of the perturbed actions are what it did (2), half the policy's (0)."""
+    expert = fac.WorldModel.create(fac.ModelConfig(8, 3, 1, 4, 6, 6), np.random.default_rng(0),
+                                   policy=True)
+    for key, value in expert.params.items():
+        value *= not key.startswith("_pi")
+    own, seen = train_expert.ReplayBuffer(8, 3, fac.EPISODE_STEPS), []
+    config = fac.DistillConfig(noise_samples=50, own_share=0.25, own_episodes=0)
+    student = train_expert.OnlineStudent(expert, 3, config, 0, own)
+    real = fac.perturbed_batch
+    monkeypatch.setattr(fac, "perturbed_batch",
+                        lambda *args: seen.append((args[2], args[3])) or real(*args))
+    for _ in range(2):
+        student.update(expert, np.ones((8, 16), np.float32), np.ones((5, 3, 16), np.float32))
+        own.add(*(np.full_like(x, 2) for x in episode(np.random.default_rng(0), 2)))
+    (obs, actions), (mixed, both) = seen
+    assert (obs == 1).all() and actions.shape == (4, 3, 16, 50) and (actions == 1).all()
+    assert (mixed[:, :4] == 2).all() and (mixed[:, 4:] == 1).all() and (both[:, :, 4:] == 1).all()
+    assert set(np.unique(both[:, :, :4])) == {0, 2} and abs(both[:, :, :4].mean() - 1) < 0.3
+
+
 def test_the_number_of_workers_changes_nothing(trained, tmp_path):
     succeeded(train("--workers", "2", "--out", "other", cwd=tmp_path))
     for kind in ("expert", "student"):
