@@ -742,8 +742,8 @@ Written by `python data/experiments.py report` from the CSVs beside it; README.m
 show. Returns: mean ± deviation over seeds (their number; one without), then the rank correlation of
 G; every run's settings are in its CSV. '10% TD-MPC' has hidden layers of 66 (B.2), which with
 Table 2's latents of 50 is 3% of the weights behind the encoder; six agents have 26%. One agent has
-layers of 512, the experts of hopper, fish, quadruped and humanoid of 256. Figure 13: latents of 50 an agent,
-so 50 N in all.
+layers of 512, the experts of hopper, fish, quadruped and humanoid of 256. Figure 13: latents of 50
+an agent, so 50 N in all.
 
 """
 REPORTS = {"figure4": report_curves, "figure5": report_curves, "figure7": report_figure7,
