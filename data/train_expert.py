@@ -303,10 +303,11 @@ class Training:
         self.args, self.config, self.planning = args, config, planning
         self.learner = make_learner(args, fac.ModelConfig(
             dim_obs, dim_action, 1, config.latent_dim, config.enc_dim, config.mlp_dim), config)
-        self.buffer, own = (ReplayBuffer(dim_obs, dim_action, config.buffer_size,
-                                         np.dtype(config.buffer_dtype)) for _ in range(2))
+        new_buffer = functools.partial(ReplayBuffer, dim_obs, dim_action, config.buffer_size,
+                                       np.dtype(config.buffer_dtype))
+        self.buffer = new_buffer()
         self.student = distilling and OnlineStudent(self.learner.model, args.num_agents,
-                                                    distilling, args.seed, own)
+                                                    distilling, args.seed, new_buffer())
         self.decisions, self.allowed, self.seconds, self.curve = 0, 0.0, 0.0, []
         self.settings = {key: getattr(args, key) for key in (
             "task", "seed", "backend", "envs", "refresh", "evaluate_every", "num_agents")}
@@ -340,7 +341,7 @@ class Training:
         """
         if self.warming:
             return {}
-        _, planners = self.tests()
+        planners = self.planners()
         model, planning = planners["expert"]
         planning = dataclasses.replace(planning, min_std=self.scheduled()["exploration_std"])
         own = {"own": planners["student"]} if self.student else {}
@@ -355,15 +356,19 @@ class Training:
             ("own episode", "own", 0.0, int(np.ceil(share * self.args.envs))))
             for seed in fac.training_seeds(self.args.seed, use, first, count)]
 
-    def tests(self):
-        """An evaluation's episodes and planners, with the training's budget and horizon of now."""
-        seeds = fac.episode_seeds(self.args.seed + 1, self.args.evaluate_episodes)
+    def planners(self):
+        """An evaluation's planners, with the training's budget and horizon of now, likewise."""
         planning = dataclasses.replace(self.planning, horizon=self.scheduled()["horizon"])
         planners = {"expert": (self.learner.model, planning)}
         if self.student:
             planners["student"] = self.student.model, dataclasses.replace(
                 planning, horizon=min(planning.horizon, self.student.config.horizon))
-        return [(seed, name) for name in planners for seed in seeds], planners
+        return planners
+
+    def tests(self):
+        """An evaluation's episodes."""
+        seeds = fac.episode_seeds(self.args.seed + 1, self.args.evaluate_episodes)
+        return [(seed, name) for name in self.models for seed in seeds]
 
     def learn(self):
         """One update of the expert and, on the same batch, one of the student; their LOSSES."""
@@ -394,7 +399,7 @@ class Training:
         envs, quota, began = self.args.envs, self.args.envs * fac.EPISODE_STEPS, time.time()
         warming, row = self.warming, {**dict.fromkeys(CURVE), **self.scheduled()}
         tested = self.curve and not warming and self.decisions % self.args.evaluate_every < quota
-        tests, planners = self.tests() if tested else ([], {})
+        tests, planners = (self.tests(), self.planners()) if tested else ([], {})
         playing = self.explorations()
         actors.begin(playing + tests)
         losses, start = [], self.learner.updates
@@ -431,9 +436,8 @@ class Training:
         """The updates that are left, and an evaluation of what came out."""
         began = time.time()
         self.learn_until(int(self.allowed), bar)
-        tests, planners = self.tests()
-        actors.begin(tests)
-        actors.play(fac.EPISODE_STEPS, planners)
+        actors.begin(tests := self.tests())
+        actors.play(fac.EPISODE_STEPS, self.planners())
         self.note(tests, actors.wait())
         self.seconds += time.time() - began
 
