@@ -357,7 +357,7 @@ class Training:
             for seed in fac.training_seeds(self.args.seed, use, first, count)]
 
     def planners(self):
-        """An evaluation's planners, with the training's budget and horizon of now, likewise."""
+        """An evaluation's planners, as `Actors.play` takes them: the budget and horizon of now."""
         planning = dataclasses.replace(self.planning, horizon=self.scheduled()["horizon"])
         planners = {"expert": (self.learner.model, planning)}
         if self.student:
