@@ -571,7 +571,8 @@ def draw_lines(path, panels, xlabel, **axes):
             ax.fill_between(x, mean - std, mean + std, color=style["color"], alpha=0.15)
         if level is not None:
             ax.axhline(level, color="black", linewidth=0.8, linestyle=(0, (1, 3)), label="expert")
-        ax.set(title=title, xlabel=xlabel, ylabel="episode return", ylim=(0, None), **axes)
+        ax.set(title=title, xlabel=xlabel, ylabel="episode return",
+               ylim=(0, 1.05 * ax.get_ylim()[1]), **axes)
         if axes:  # logarithmic: a tick for each point
             ax.set_xticks(x := sorted(set().union(*lines.values())), [f"{v:.0f}" for v in x])
             ax.minorticks_off()
@@ -722,7 +723,8 @@ def report_figure8(_, path, figures):
                 if ("none", 0) in values:
                     ax.axhline(np.mean(values["none", 0]), color=f"C{i}", linestyle=("-", "--")[i])
             what = "one action is noise" if kind == "noise" else f"one motor x {kind}"
-            ax.set(title=f"{task}: {what}", xlabel="action dimension", ylabel="episode return")
+            ax.set(title=f"{task}: {what}", xlabel="action dimension", ylabel="episode return",
+                   xticks=joints)
         both = set.intersection(*(set(values) for values in cases.values()))  # measured for all
         result[task] = {case: {kind: float(np.mean([np.mean(values[k, j]) for k, j in both
                                                     if k == kind]))
