@@ -112,7 +112,7 @@ class Settings:
 @dataclass(frozen=True)
 class ModelConfig(Settings):
     """Sizes of a world model. Raises UserError if the agents don't share the actions evenly."""
-    dim_obs: int = field(0, "O: observation features")
+    dim_obs: int = field(0, "O: observation features", least=1)
     dim_action: int = field(0, "A: action dimensions", most=1_000_000)
     num_agents: int = field(1, "N: 1 is TD-MPC, A is Fac-TDMPC")
     latent_dim: int = field(50, "m: latent features of an agent (Table 2)", least=1)
@@ -178,7 +178,7 @@ class DistillConfig(Settings):
     clip_actions: bool = field(True, "clip perturbed actions to [-1, 1] [D7]", paper=False)
     reuse: int = field(4, "steps that learn from a state's perturbations [D1]", paper=1, least=1)
     horizon: int = field(3, "H of loss and planning (Table 2)", least=0, most=EPISODE_STEPS - 1)
-    lam: float = field(0.5, "lambda (rho in Table 2): step h weighs lambda^h", least=0)
+    lam: float = field(0.5, "lambda (rho in Table 2): step h weighs lambda^h", least=0, most=1)
     reward_coef: float = field(0.5, "weight of the rewards' divergence (Table 2)", least=0)
     value_coef: float = field(0.1, "weight of each Q's divergence (Table 2)", least=0)
     temperature_student: float = field(0.5, "T_s of Equation 4 (authors' code)", above=0)
@@ -604,7 +604,7 @@ def distill_loss(student, features, actions, targets, config, grads=None, diverg
 
     features (1, F, B): what the student's encoder reads in the first states; actions
     (L, A, B, K): perturbed; targets: the expert's `predict` for them. Returns the loss and
-    the mean divergences of reward and value over steps and states."""
+    the mean divergences of reward and value over steps and states. divergence: as `soft_kl`."""
     tapes, encoder_tape = defaultdict(list), []
     z = student.encode_features(features, encoder_tape)
     outputs = predict(student, z, actions, tapes)
@@ -624,15 +624,15 @@ def distill_loss(student, features, actions, targets, config, grads=None, diverg
     return loss, means[0], (means[1] + means[2]) / 2
 
 
-def new_student(expert, sizes, seed):
-    """A fresh student of an expert, behind Adam on those of its weights that are trained.
+def new_student(expert, config, seed):
+    """(Adam, student): a fresh student of an expert, and Adam on those of its weights that train.
 
     Where the student reads the expert's latent, it shares the expert's own encoder arrays [D3]."""
-    student = WorldModel.create(sizes, stream(seed, "student"))
+    student = WorldModel.create(config, stream(seed, "student"))
     frozen = {"_expert" + k: v for k, v in expert.params.items()
-              if k.startswith("_encoder.") and sizes.expert_latent_dim}
+              if k.startswith("_encoder.") and config.expert_latent_dim}
     optimizer = Adam({k: v for k, v in student.params.items() if not k.startswith("_expert")})
-    return optimizer, WorldModel(sizes, {**optimizer.params, **frozen})
+    return optimizer, WorldModel(config, {**optimizer.params, **frozen})
 
 
 def learning_rate(config, t):
@@ -656,8 +656,8 @@ def perturbed_batch(expert, student, obs, actions, config, rng):
 
 
 def own_actions(expert, obs, played, copies, rng):
-    """Actions (L, A, B, K) to perturb in the student's own states obs (O, B) [D8]: for each copy by
-    a coin what the expert's policy would do, or what the student `played` there (L, A, B)."""
+    """Actions (L, A, B, K) to perturb in the student's own states obs (O, B) [D8]: for each copy of
+    each, by a coin, what the expert's policy would do or what the student `played` (L, A, B)."""
     pi = policy_rollout(expert, expert.encode(obs), [F32(0)] * len(played))[:, 0]
     return np.where(rng.random((len(obs.T), copies)) < 0.5, pi[..., None], played[..., None])
 
@@ -673,7 +673,7 @@ class Distiller:
     computed once and learned from `reuse` times. Two threads share that, and each step's batch:
     NumPy lets go of the interpreter inside its products. sizes: in place of `student_config`'s."""
 
-    loss = staticmethod(distill_loss)
+    loss = staticmethod(distill_loss)  # a subclass may have another, as Figure 5's MSE has
 
     def __init__(self, expert, replay, config, num_agents=None, seed=0, **sizes):
         theirs = expert.config
@@ -695,7 +695,7 @@ class Distiller:
         self._number = None
         self._threads = ThreadPoolExecutor(2)
         self._halves = [flatten({k: np.zeros_like(v) for k, v in self.optimizer.params.items()})
-                        for _ in range(2)]
+                        for _ in range(2)]  # each thread's gradient: a vector, its parts by name
 
     def draw(self, number, part, size):
         """Lines 4 and 6 (expert) for `size` states, a pool's part, as `perturbed_batch`."""
@@ -767,7 +767,7 @@ class Distiller:
         return self.optimizer.t
 
     def add(self, observation, action):
-        """Let the student's episodes (E, T, O), (E, T, A) join the data [D8]; T: EPISODE_STEPS."""
+        """Let episodes (E, T, O), (E, T, A) join `own` (all, T, O + A) [D8]; T: EPISODE_STEPS."""
         episodes = np.concatenate([observation, action], 2).astype(np.float16)
         self.own = np.concatenate([self.own, episodes])
         self._number = None  # its pool is drawn again, with them
@@ -801,7 +801,7 @@ def horizon_returns(rewards, q1, q2, discount):
 
 
 def rank_correlation(distiller, states, discount=0.99):
-    """How alike student and expert order perturbed actions, which is what the loss asks for.
+    """How alike student and expert order perturbed actions, as they do where the loss is smallest.
 
     Spearman's correlation over 32 action sequences, mean over `states` held-out states; 1 is the
     same order (section 4.4). Returns that of the global Q at each step h of the rollout, and that
@@ -843,7 +843,7 @@ def mppi(returns, mean, config, rngs, proposals=None):
     one Generator for each agent; proposals (N, L, d, P): sequences that compete in every iteration.
     Elites are chosen agent by agent (Equation 3): G is a sum of G_i(a_i), so the best of each is
     the best of all (Proposition 1). N = 1 is centralized MPPI. Returns the new mean (N, L, d), the
-    last elites (N, L, d, E) and their scores (N, E), which sum to 1."""
+    last elites (N, L, d, E), their scores (N, E), which sum to 1. UserError if no G is finite."""
     mean, std = mean[..., None], F32(config.max_std)
     if proposals is not None:
         G_proposals = returns(proposals)
@@ -895,7 +895,7 @@ class AgentPlanner:
 
     def __init__(self, model, config, rows=None, swap=None):
         self.model, self.config = model, config
-        self.returns = None if config.returns == "plain" else Returns(model, rows, swap)
+        self.fast = None if config.returns == "plain" else Returns(model, rows, swap)
         self.reset([])
 
     def reset(self, seeds):
@@ -908,7 +908,7 @@ class AgentPlanner:
     def plan(self, z):
         """z (N, m, 1) -> the agents' first actions (N, d); keeps the warm start."""
         config = self.config
-        returns = (self.returns.start(z, config) if self.returns else
+        returns = (self.fast.start(z, config) if self.fast else
                    functools.partial(h_step_return, self.model, z, config=config))
         mean, elites, scores = mppi(returns, self.mean, config, self.rngs, self._proposals(z))
         self.mean = np.concatenate([mean[:, 1:], np.zeros_like(mean[:, :1])], 1)
@@ -930,9 +930,9 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
             action = planner.act(obs)      # (O,) -> (A,) in [-1, 1]
 
     workers: processes beside this one; each plans for a part of the agents (0: all here).
-    Every agent owns its random stream and one BLAS thread computes each product, so the plan
-    is the same, bit for bit, for every number of workers. Raises WorkerError when a worker
-    has died. Some weights are copied: make a new one when they have changed."""
+    Every agent owns its random stream and one BLAS thread computes each product, so the plan is the
+    same, bit for bit, for every number of workers. Raises UserError for too many, WorkerError when
+    one has died. Some weights are copied: make a new planner when they have changed."""
 
     def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
         self.model, sizes = model, model.config
@@ -954,7 +954,7 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
         self.own.reset(seeds[self._parts[0]])
 
     def act(self, obs):
-        """obs (O,), anything that converts to float32 -> action (A,) float32 in [-1, 1]."""
+        """obs (O,) -> action (A,), float32 in [-1, 1]. UserError for another shape, or NaN."""
         obs = np.asarray(obs, F32)
         shape = (self.model.config.dim_obs,)
         need(obs.shape == shape, f"observation: expected shape {shape}, found {obs.shape}")
@@ -1218,14 +1218,12 @@ def _run_worker(target, connection):
 
 # ==== 6. Environments (appendix B.1) ==================================================
 
-# paper's name: (dm_control domain, task, dim O, dim A); the dimensions are Figure 3's
+# dm_control's domain and task: (dim O, dim A) of Figure 3
 TASKS = {
-    "reacher-easy": ("reacher", "easy", 8, 3), "reacher-hard": ("reacher", "hard", 8, 3),
-    "hopper-hop": ("hopper", "hop", 15, 4), "fish-swim": ("fish", "swim", 24, 5),
-    "cheetah-run": ("cheetah", "run", 17, 6), "walker-walk": ("walker", "walk", 24, 6),
-    "walker-run": ("walker", "run", 24, 6),
-    "quadruped-walk": ("quadruped", "walk", 78, 12), "quadruped-run": ("quadruped", "run", 78, 12),
-    "humanoid-stand": ("humanoid", "stand", 67, 21), "humanoid-walk": ("humanoid", "walk", 67, 21)}
+    "reacher-easy": (8, 3), "reacher-hard": (8, 3), "hopper-hop": (15, 4), "fish-swim": (24, 5),
+    "cheetah-run": (17, 6), "walker-walk": (24, 6), "walker-run": (24, 6),
+    "quadruped-walk": (78, 12), "quadruped-run": (78, 12),
+    "humanoid-stand": (67, 21), "humanoid-walk": (67, 21)}
 REACHER_TARGET = {"easy": 0.05, "hard": 0.015}  # radius of the target, metres
 REACHER = DATA / "reacher.xml"  # three links; dm_control's has two
 
@@ -1284,7 +1282,7 @@ def lookup_task(task):
         near = difflib.get_close_matches(str(task), TASKS, n=1, cutoff=0)
         raise UserError(f"unknown task {task!r}; did you mean {near[0]!r}? "
                         f"Known tasks: {', '.join(TASKS)}")
-    return TASKS[task]
+    return *task.split("-"), *TASKS[task]
 
 
 def episode_seeds(seed, episodes):
@@ -1336,8 +1334,8 @@ def write_npz(path, header, arrays, compress=False):
         (np.savez_compressed if compress else np.savez)(file, header=text, **arrays)
 
 
-def read_npz(path, kind):
-    """(header, arrays) of a file that `write_npz` made; UserError names what is wrong."""
+def read_npz(path, kinds):
+    """(header, arrays) of a file, of one of `kinds`, by `write_npz`; UserError: what is wrong."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {key: np.asarray(file[key]) for key in file.files}
@@ -1355,7 +1353,7 @@ def read_npz(path, kind):
                         f"are made by data/train_expert.py and distill") from None
     need(header.get("format") == FORMAT, f"{path}: header: format: expected {FORMAT!r}, found "
          f"{header.get('format')!r}; a newer version's file needs that version of this project")
-    need(header.get("kind") in kind, f"{path}: header: kind: expected {' or '.join(kind)}, found "
+    need(header.get("kind") in kinds, f"{path}: header: kind: expected {' or '.join(kinds)}, found "
          f"{header.get('kind')!r}")
     return header, arrays
 
@@ -1432,7 +1430,7 @@ class Replay:
     def starts(self, steps, held_out):
         """Rows from which `steps` actions stay in their episode: (training, held-out) rows.
 
-        Every (1 / held_out)-th episode is held out, so that all of the expert's training counts."""
+        Every (1 / held_out)-th episode is held out: all of training counts. UserError: too few."""
         every = max(2, round(1 / held_out))
         training, held = [], []
         for i, (begin, end) in enumerate(zip(np.r_[0, self.ends + 1], self.ends)):
@@ -1476,8 +1474,10 @@ def data_file(task, name):
 
 def decisions(model, task, config, seeds, environment=None):
     """Plan through the episode of each seed; yields every decision's observation (O,), action
-    (A,), reward and seconds of planning. environment: to use instead of the task's own."""
-    environment, planner = environment or Environment(task), Planner(model, config)
+    (A,), reward and seconds of planning. environment: one of EPISODE_STEPS decisions an episode, to
+    use instead of the task's own."""
+    environment = Environment(task) if environment is None else environment
+    planner = Planner(model, config)
     for seed in seeds:
         planner.reset(seed)
         obs = environment.reset(seed)
@@ -1501,12 +1501,12 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
     """Plan through the episodes of `seeds`: observations (E, T, O), actions (E, T, A), rewards
     (E, T) and seconds of planning (E, T), with T = EPISODE_STEPS.
 
-    workers: processes that share the episodes [one for each core]; 0: all in this one, which alone
-    can use an `environment`. An episode depends on its seed, not on their number."""
+    workers: processes that share the episodes [one for each core]; 0, or with an `environment`: all
+    in this one. An episode depends on its seed, not on their number."""
     E, T, sizes = len(seeds), EPISODE_STEPS, model.config
     found = [np.zeros((E, T, *shape), F32) for shape in ((sizes.dim_obs,), (sizes.dim_action,))]
     found += [np.zeros((E, T)) for _ in range(2)]
-    workers = min(cores() if workers is None else workers, E)
+    workers = 0 if environment is not None else min(cores() if workers is None else workers, E)
     parts = [range(w, E, workers or 1) for w in range(workers or 1)]
     here, done = decisions(model, task, config, seeds, environment), [0] * len(parts)
     with progress(label, E * T, "decision") as bar, \
@@ -1802,8 +1802,8 @@ def evaluate_both(expert, record, student, args, planning):
 
 
 def time_both(expert, student, planning, obs):
-    """Milliseconds of a decision, both planning alike, the student also with a process on each
-    core; where that costs more than it saves, it counts as planning in one. Result's part."""
+    """Milliseconds of a decision, the expert's with its proposals, the student also with a process
+    on each core; where that costs more than it saves, it counts as planning in one. For result."""
     beside = useful_workers(student.config.num_agents)
     with contextlib.ExitStack() as stack:
         acts = [stack.enter_context(Planner(model, planning, workers=workers)).act

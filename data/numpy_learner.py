@@ -40,7 +40,7 @@ class ExpertConfig(fac.Settings):
 
 
 def td_targets(model, target, obs, reward, noise, discount):
-    """What Equation 1 holds fixed: latents of the moving-average encoder, and TD targets.
+    """What TD-MPC's code holds fixed: latents of the moving-average encoder, and TD targets.
 
     obs (H, O, B): the observation after each action; reward (H, B); noise (A, H * B): the
     policy's. Returns (1, m, H * B), columns ordered (H, B), and the targets
@@ -57,7 +57,8 @@ def equation_1(model, obs, actions, reward, latents, td, config, grads=None):
         1/H sum_{h=0}^{H-1} lambda^h [c_T |s_{h+1} - latents_h|^2 + c_R (r_h - reward_h)^2
                             + c_Q ((Q1_h - td_h)^2 + (Q2_h - td_h)^2)],  means over B and m,
 
-    as TD-MPC's code has it (the paper prints h = 0..H, sums over m, one Q and no coefficients).
+    as TD-MPC's code has it (the paper prints h = 0..H without 1/H, sums over m, one Q, no
+    coefficients, and holds fixed the latents of f_E itself, not of its moving average).
 
     obs (O, B): the first ones; actions (H, A, B); reward (H, B); latents and td from `td_targets`.
     Returns the loss, its three sums over h without coefficients, and the rollout s_0, ..., s_H

@@ -53,7 +53,7 @@ def python(code, **env):
 
 
 def test_tasks_are_the_eleven_of_the_paper():
-    assert {task: tuple(dims) for task, (_, _, *dims) in fac.TASKS.items()} == FIGURE_3
+    assert fac.TASKS == FIGURE_3
 
 
 @pytest.mark.parametrize("task", FIGURE_3)
@@ -115,6 +115,21 @@ def test_500_decisions_end_where_the_episode_of_dm_control_ends(task, monkeypatc
         env.step(np.zeros(env.dim_action))
     assert fac.EPISODE_STEPS == 500
     assert last == [False] * 999 + [True]
+
+
+def test_an_environment_of_one_s_own_is_played_here_whatever_its_truth_value():
+    class Own(list):
+        def reset(self, seed):
+            return np.full(3, seed, np.float32)
+
+        def step(self, action):
+            return np.zeros(3, np.float32), float(action.shape == (2,))
+
+    model = fac.WorldModel.create(fac.ModelConfig(3, 2, 2, 2, 4, 4), np.random.default_rng(0))
+    obs, _, rewards, _ = fac.play(model, "a robot", fac.PlannerConfig(samples=2, iterations=1,
+                                                                     horizon=0), [5, 7],
+                                  environment=Own())
+    assert obs[:, 0, 0].tolist() == [5, 7] and rewards.sum(1).tolist() == [500, 500]
 
 
 def test_actions_are_scaled_to_the_action_spec(monkeypatch):

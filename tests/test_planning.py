@@ -144,8 +144,8 @@ def test_warm_start_shifts_by_one():
     z = model.encode(np.zeros((8, 1), np.float32))
     for one in (planner, twin):
         one.reset(np.random.SeedSequence(0).spawn(3))
-    twin.returns.start(z, config)
-    mean, _, _ = fac.mppi(twin.returns, twin.mean, config, twin.rngs)
+    twin.fast.start(z, config)
+    mean, _, _ = fac.mppi(twin.fast, twin.mean, config, twin.rngs)
     planner.plan(z)
     assert np.array_equal(planner.mean[:, :-1], mean[:, 1:])
     assert not planner.mean[:, -1].any() and planner.mean[:, :-1].any()
@@ -223,7 +223,7 @@ def test_an_agent_that_two_processes_share_is_planned_bit_for_bit(workers):
     config = fac.PlannerConfig(samples=500, iterations=3)
     with fac.Planner(model, config) as alone, \
             fac.Planner(model, config, workers=workers) as parallel:
-        assert len(parallel.own.returns.rows) == 4
+        assert len(parallel.own.fast.rows) == 4
         for o in obs:
             assert np.array_equal(alone.act(o), parallel.act(o))
 
