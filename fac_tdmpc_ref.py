@@ -17,11 +17,10 @@ the case N = 1. There is one world model, one planner, one loss. The axes, every
     m   latent features of an agent; a latent, the paper's s, is z (N, m, B) in the code
     d   action dimensions of an agent: dim(A) / N
     O   observation features;   A = N * d   action dimensions
-    B   batch;   S   action sequences (the last axis)
+    B   batch;   S   action sequences (the last axis);   M   rows of a replay
     K   noise samples of the distillation loss (behind B): actions are (L, A, B, K) there
     H   horizon: H rewards, then Q;   L   actions of a sequence: H + 1 in Equations 2 and 4
     F   features an encoder reads;   P   proposals;   E   elites, or episodes;   T   decisions
-    M   rows of a replay
 
 A layer is W (N, out, in), b (N, out, 1) and computes W @ x + b on x (N, in, B): samples last, so
 that activations run over long contiguous rows, and a torch Linear.weight goes in as weight[None].
@@ -1342,8 +1341,8 @@ def read_npz(path, kinds):
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
     except Exception as error:  # a damaged file can raise nearly anything
-        raise UserError(f"{path}: not a readable .npz file ({' '.join(str(error).split())})"
-                        ) from None
+        reason = " ".join(str(error).split()).split(". ")[0]  # NumPy advises to load it unsafely
+        raise UserError(f"{path}: not a readable .npz file ({reason})") from None
     try:
         header = json.loads(arrays.pop("header").tobytes())
         if not isinstance(header, dict):
@@ -1474,8 +1473,7 @@ def data_file(task, name):
 
 def decisions(model, task, config, seeds, environment=None):
     """Plan through the episode of each seed; yields every decision's observation (O,), action
-    (A,), reward and seconds of planning. environment: one of EPISODE_STEPS decisions an episode, to
-    use instead of the task's own."""
+    (A,), reward and seconds of planning. environment: instead of the task's, equally long."""
     environment = Environment(task) if environment is None else environment
     planner = Planner(model, config)
     for seed in seeds:
@@ -1771,6 +1769,8 @@ def distil_and_save(distiller, args, planning, header, out):
     if (path := out / "student.npz").exists():  # a run that this one would replace
         before, _ = read_npz(path, ("student",))
         same_settings({key: before.get(key) for key in settings}, settings, path)
+    elif (path := out / "config.json").exists() and not (out / "checkpoint.npz").exists():
+        raise UserError(f"{path}: not this run's, which would replace it; choose another --out")
     print(f"{args.task}: {student.config.num_agents} agents, {len(distiller.optimizer.vector):,} "
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)

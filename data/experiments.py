@@ -60,7 +60,7 @@ def read_rows(path):
     head, *lines = text.splitlines() or [""]
     columns = ",".join(ROW)  # of which a kill may have left a part
     fac.need(head == columns or "\n" not in text and columns.startswith(head),
-             f"{path}: expected the columns {columns}, found {head[:200]}; choose another --out")
+             f"{path}: expected the columns {columns}, found {head[:200]!r}; choose another --out")
     rows = []
     for line in lines:
         try:
@@ -381,7 +381,10 @@ def load(task, seed, case, students):
     path = Path(students) / f"{task}-{seed}" / "student.npz"
     fac.need(path.exists(), f"{path}: no such file; make it with 'python fac_tdmpc_ref.py distill "
              f"--task {task} --seed {seed}', or name the folder above with --students")
-    return fac.load_model(path)
+    model, header = fac.load_model(path)
+    kind = header["kind"]
+    fac.need(kind == "student", f"{path}: header: kind: expected 'student', found {kind!r}")
+    return model, header
 
 
 def planning_runs(args, variants):
@@ -762,7 +765,7 @@ def command_report(args):
         if finished(read_rows(results / f"{name}.csv")):
             try:
                 result[name], table = make(name, results / f"{name}.csv", figures)
-            except (KeyError, IndexError, ValueError) as error:
+            except (LookupError, ValueError, TypeError, StopIteration) as error:
                 raise fac.UserError(f"{results / name}.csv: not {name}'s rows ({error!r})"
                                     ) from None
             title = name.replace("figure", "Figure ").capitalize()

@@ -420,6 +420,11 @@ def run(args):
          "another expert's; choose another --out, or pass --replay or --collect")
     need(not (out / "checkpoint.npz").exists(), f"{out / 'checkpoint.npz'}: a run of "
          "train_expert.py, whose files would be replaced; choose another --out")
+    if (path := out / "expert.npz").exists():
+        _, there = fac.read_npz(path, ("expert", "student"))
+        need(there.keys() == weights.keys() and all(np.array_equal(there[k], weights[k])
+                                                    for k in there),
+             f"{path}: another expert, which would be replaced; choose another --out")
     fac.check_writable(out / "expert.npz")
     if environment and not arrays:
         with tempfile.TemporaryDirectory() as scratch:  # an expert is replaced with its replay

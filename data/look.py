@@ -99,7 +99,7 @@ def command_watch(args):
     models = [(args.model, model, header)]
     if args.beside:
         models.append((args.beside, *fac.load_model(args.beside)))
-        fac.check_task(models[1][1].config, task)
+        fac.check_task(models[1][1].config, task, args.beside)
     choose_renderer()
     environment = fac.Environment(task)
     seed = fac.episode_seeds(args.seed, args.episode + 1)[args.episode]
@@ -193,11 +193,14 @@ def frames_at(task, seed, actions, moments):
 
 def command_figure9(args):
     """figure9: latents by joint, and what each joint contributes in the best and worst episode."""
-    model, header, task = open_model(args)
+    model, header, task = open_model(args, ["student"])
     plt, began = pyplot_for(args.out), time.time()
     with fac.optional("scikit-learn", "experiments"):
         import sklearn  # noqa: F401  (missed before the episodes are played)
     config = fac.PlannerConfig(**fac.made_for(header, args.model))
+    fac.need(model.config.latent_dim > 1 and config.horizon < fac.EPISODE_STEPS - SMOOTH,
+             f"{args.model}: expected latents of 2 or more and a horizon below "
+             f"{fac.EPISODE_STEPS - SMOOTH}, found {model.config.latent_dim}, {config.horizon}")
     seeds = fac.episode_seeds(args.seed, args.episodes)
     obs, actions, rewards, _ = fac.play(model, task, config, seeds)
     returns, rng = rewards.sum(1), np.random.default_rng(0)
@@ -258,7 +261,7 @@ def agreement(student, expert, obs, actions, rng, values=32):
 
 def command_agreement(args):
     """agreement: which joint's share ranks its actions as the expert's Q does, and when."""
-    student, header, args.task = open_model(args)
+    student, header, args.task = open_model(args, ["student"])
     (expert, _, replay, _), task = fac.load_data(args), args.task
     expected = fac.data_checksums(expert, replay)
     data, weight = header.get("data", expected), expert.params["_encoder.0.weight"]
@@ -298,9 +301,11 @@ def command_agreement(args):
     return result
 
 
-def open_model(args):
-    """(model, header, task) that --model and --task name."""
+def open_model(args, kinds=("expert", "student")):
+    """(model, header, task) that --model, of one of these kinds, and --task name."""
     model, header = fac.load_model(args.model)
+    fac.need(header["kind"] in kinds, f"{args.model}: header: kind: expected {' or '.join(kinds)}, "
+             f"found {header['kind']!r}")
     fac.need(task := args.task or header.get("task"), f"{args.model}: header: no task; pass --task")
-    fac.check_task(model.config, task)
+    fac.check_task(model.config, task, args.model)
     return model, header, task

@@ -577,6 +577,13 @@ def test_a_finished_run_is_not_replaced_by_one_with_other_settings(distilled, fi
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
+def test_another_program_s_configuration_is_not_replaced(tmp_path, files, capsys):
+    (tmp_path / "config.json").write_text("an hour's work")
+    assert fac.main([str(a) for a in distill_arguments(files, "--out", tmp_path)]) == 2
+    assert "config.json: not this run's" in capsys.readouterr().err.splitlines()[-1]
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["an hour's work"]
+
+
 # evaluate and the record of the expert ------------------------------------------------
 
 def test_what_stops_several_workers_is_said_once(tmp_path, distilled):

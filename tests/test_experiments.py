@@ -269,6 +269,14 @@ def test_report_names_the_file_that_holds_another_figure_s_runs(tmp_path, figure
             f"{figure}'s rows")
 
 
+def test_report_names_the_file_whose_rows_lack_a_return(tmp_path):
+    pytest.importorskip("matplotlib")
+    rows = [{**experiments.make_run("reacher-hard", 0, "expert"), "minutes": 1.0}]
+    experiments.append_rows(tmp_path / "figure8.csv", rows)
+    refused(run("report", "--results", ".", "--figures", ".", cwd=tmp_path), "figure8.csv: not "
+            "figure8's rows")
+
+
 @pytest.mark.parametrize("found", [b"a,b\n1,2\n", b'{"not": "rows"}', b"\xff\xfe\n"])
 def test_rows_of_another_kind_are_refused(tmp_path, found):
     (tmp_path / "x.csv").write_bytes(found)
@@ -697,6 +705,8 @@ def test_figure9_and_agreement_draw_a_model(tmp_path):
     assert len(found["held_out"]) == len(found["worst_episode"]) == 3
     assert np.abs(found["when"]).max() <= 1
     assert (tmp_path / "agreement.png").exists()
+    for name in ("agreement", "figure9"):
+        refused(run(name, "--model", "expert.npz", cwd=tmp_path), "expert.npz", "'expert'")
     shutil.copy(fac.data_file("walker-run", "replay.npz"), tmp_path / "other.npz")
     refused(run("agreement", "--model", "student.npz", "--expert", ".", "--replay", "other.npz",
                 cwd=tmp_path), "other.npz", "--replay")

@@ -828,7 +828,9 @@ def test_collected_episodes_distil_and_depend_on_the_seed_alone(tmp_path, capsys
     for flags, part in (([str(tmp_path / "a" / "expert.npz")], "expert.npz: would be replaced"),
                         ([str(model), "--replay", str(tmp_path / "a" / "replay.npz")],
                          "replay.npz: would be replaced"),
-                        ([str(model)], "replay.npz: another expert's; choose another --out")):
+                        ([str(model)], "replay.npz: another expert's; choose another --out"),
+                        ([str(fac.data_file("reacher-easy", "expert.npz")), "--collect", "3"],
+                         "expert.npz: another expert")):
         assert import_expert.main([*flags, "--task", TASK, "--out", str(tmp_path / "a")]) == 2
         assert part in capsys.readouterr().err
 
