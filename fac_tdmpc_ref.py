@@ -1352,8 +1352,8 @@ def read_npz(path, kinds):
                         f"are made by data/train_expert.py and distill") from None
     need(header.get("format") == FORMAT, f"{path}: header: format: expected {FORMAT!r}, found "
          f"{header.get('format')!r}; a newer version's file needs that version of this project")
-    need(header.get("kind") in kinds, f"{path}: header: kind: expected {' or '.join(kinds)}, found "
-         f"{header.get('kind')!r}")
+    need(header.get("kind") in kinds, f"{path}: header: kind: expected {' or '.join(kinds)!r}, "
+         f"found {header.get('kind')!r}")
     return header, arrays
 
 
@@ -1366,9 +1366,9 @@ def save_model(path, model, header):
     write_npz(path, {**header, "model": asdict(model.config)}, arrays)
 
 
-def load_model(path):
-    """(model, header) of an expert or student. UserError names file, key, expected and found."""
-    header, arrays = read_npz(path, ("expert", "student"))
+def load_model(path, kinds=("expert", "student")):
+    """(model, header) of one of these kinds. UserError names file, key, expected and found."""
+    header, arrays = read_npz(path, kinds)
     config = from_dict(ModelConfig, header.get("model"), f"{path}: header: model")
     params = {}
     for name, i, kind, shape, _ in layers(config, policy="_pi.0.weight" in arrays):
@@ -1749,10 +1749,9 @@ def load_data(args):
     path = Path(args.expert or data_file(args.task, "expert.npz"))
     if path.is_dir():  # as train_expert.py and data/TASK hold them
         path /= "expert.npz"
-    expert, header = load_model(path)
-    for key, expected in (("kind", "expert"), ("task", args.task)):
-        need(header.get(key) == expected, f"{path}: header: {key}: expected {expected!r}, found "
-             f"{header.get(key)!r}")
+    expert, header = load_model(path, ["expert"])
+    need(header.get("task") == args.task, f"{path}: header: task: expected {args.task!r}, found "
+         f"{header.get('task')!r}")
     check_task(expert.config, args.task)
     Environment(args.task)  # what is missing is missed now, not after the last step
     replay = Replay(args.replay or path.with_name("replay.npz"))

@@ -381,10 +381,7 @@ def load(task, seed, case, students):
     path = Path(students) / f"{task}-{seed}" / "student.npz"
     fac.need(path.exists(), f"{path}: no such file; make it with 'python fac_tdmpc_ref.py distill "
              f"--task {task} --seed {seed}', or name the folder above with --students")
-    model, header = fac.load_model(path)
-    kind = header["kind"]
-    fac.need(kind == "student", f"{path}: header: kind: expected 'student', found {kind!r}")
-    return model, header
+    return fac.load_model(path, ["student"])
 
 
 def planning_runs(args, variants):
@@ -727,7 +724,7 @@ def report_figure8(_, path, figures):
                     ax.axhline(np.mean(values["none", 0]), color=f"C{i}", linestyle=("-", "--")[i])
             what = "one action is noise" if kind == "noise" else f"one motor x {kind}"
             ax.set(title=f"{task}: {what}", xlabel="action dimension", ylabel="episode return",
-                   xticks=joints)
+                   xticks=sorted({j for own in cases.values() for k, j in own if k == kind}))
         both = set.intersection(*(set(values) for values in cases.values()))  # measured for all
         result[task] = {case: {kind: float(np.mean([np.mean(values[k, j]) for k, j in both
                                                     if k == kind]))

@@ -193,7 +193,7 @@ def frames_at(task, seed, actions, moments):
 
 def command_figure9(args):
     """figure9: latents by joint, and what each joint contributes in the best and worst episode."""
-    model, header, task = open_model(args, ["student"])
+    model, header, task = open_model(args, kinds=["student"])
     plt, began = pyplot_for(args.out), time.time()
     with fac.optional("scikit-learn", "experiments"):
         import sklearn  # noqa: F401  (missed before the episodes are played)
@@ -261,7 +261,7 @@ def agreement(student, expert, obs, actions, rng, values=32):
 
 def command_agreement(args):
     """agreement: which joint's share ranks its actions as the expert's Q does, and when."""
-    student, header, args.task = open_model(args, ["student"])
+    student, header, args.task = open_model(args, kinds=["student"])
     (expert, _, replay, _), task = fac.load_data(args), args.task
     expected = fac.data_checksums(expert, replay)
     data, weight = header.get("data", expected), expert.params["_encoder.0.weight"]
@@ -301,11 +301,9 @@ def command_agreement(args):
     return result
 
 
-def open_model(args, kinds=("expert", "student")):
-    """(model, header, task) that --model, of one of these kinds, and --task name."""
-    model, header = fac.load_model(args.model)
-    fac.need(header["kind"] in kinds, f"{args.model}: header: kind: expected {' or '.join(kinds)}, "
-             f"found {header['kind']!r}")
+def open_model(args, **kinds):
+    """(model, header, task) that --model, of `load_model`'s kinds, and --task name."""
+    model, header = fac.load_model(args.model, **kinds)
     fac.need(task := args.task or header.get("task"), f"{args.model}: header: no task; pass --task")
     fac.check_task(model.config, task, args.model)
     return model, header, task
