@@ -928,10 +928,11 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
         with Planner(model, PlannerConfig(), seed=0, workers=1) as planner:
             action = planner.act(obs)      # (O,) -> (A,) in [-1, 1]
 
-    workers: processes beside this one; each plans for a part of the agents (0: all here).
-    Every agent owns its random stream and one BLAS thread computes each product, so the plan is the
-    same, bit for bit, for every number of workers. Raises UserError for too many, WorkerError when
-    one has died. Some weights are copied: make a new planner when they have changed."""
+    workers: processes beside this one, each for a part of the agents (0: all here). They import the
+    file that makes the planner, which needs `if __name__ == "__main__":`. Every agent owns its
+    random stream and one BLAS thread computes each product, so the plan is the same, bit for bit,
+    for every number of workers. Raises UserError for too many, WorkerError when one has died. Some
+    weights are copied: make a new planner when they have changed."""
 
     def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
         self.model, sizes = model, model.config
@@ -943,6 +944,7 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
         super().__init__()
         self._workers = self.enter_context(Workers(_planning_worker, workers, "planning worker"))
         self._workers.send_all(others)
+        self._workers.receive_all()  # they are ready: no decision waits for their start
         self.reset(np.random.SeedSequence(seed).entropy)  # None: the system's own
 
     def reset(self, seed=None):
@@ -1128,6 +1130,7 @@ def _planning_worker(connection):
     """Plans for its part of the agents: latents in, actions out; a list is `reset`'s seeds. Where
     agents are shared, each iteration's returns go out and come back added up."""
     planner = AgentPlanner(*connection.recv(), lambda G: connection.send(G) or connection.recv())
+    connection.send("ready")
     while True:
         message = connection.recv()
         if isinstance(message, list):
@@ -1361,6 +1364,7 @@ def save_model(path, model, header):
     """Weights under TD-MPC's names; torch shapes where N = 1, else with a leading agent axis."""
     arrays = {}
     for key, value in model.params.items():
+        need(value.ndim == 3, f"{key}: expected (N, rows, columns), found {value.shape}")
         value = value[..., 0] if key.endswith("bias") or key.split(".")[1] == "1" else value
         arrays[key] = value[0] if len(value) == 1 else value
     write_npz(path, {**header, "model": asdict(model.config)}, arrays)
@@ -1465,7 +1469,7 @@ def data_file(task, name):
         shipped = ", ".join(sorted(p.parent.name for p in DATA.glob("*/expert.npz"))) or "none"
         raise UserError(f"{path}: no such file; the repository (a pip install doesn't) holds "
                         f"{shipped}. Train one with 'python data/train_expert.py --task {task}' "
-                        f"there and copy its files, or name them with --expert and --replay")
+                        f"there and copy its files here, or give distill --expert and --replay")
     return path
 
 
@@ -1621,15 +1625,15 @@ def check_finite(values, update, lr):
              f"learning diverged; lower the learning rate ({lr})")
 
 
-def same_settings(found, expected, where):
+def same_settings(found, expected, where, group=""):
     """UserError if a file is of a run with other settings (dicts, whose values may be dicts)."""
     for key in {**found, **expected}:
         values = found.get(key), expected.get(key)
         if all(isinstance(value, dict) for value in values):
-            same_settings(*values, where)
+            same_settings(*values, where, f"{key}: ")
         else:
-            need(values[0] == values[1], f"{where}: a run with other settings ({key}: expected "
-                 f"{values[1]}, found {values[0]}); choose another --out, or empty this one")
+            need(values[0] == values[1], f"{where}: a run with other settings ({group}{key}: "
+                 f"expected {values[1]}, found {values[0]}); choose another --out, or empty it")
 
 
 def write_curve(path, columns, rows):
@@ -1704,8 +1708,7 @@ def read_records(path):
         records = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
         return {key: [float(r) for r in returns] for key, returns in records.items()}
     except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise UserError(f"{path}: not a file that evaluate --record wrote ({error}); delete it and "
-                        f"record anew") from None
+        raise UserError(f"{path}: not what evaluate --record writes ({error}); delete it") from None
 
 
 def record_key(model, config, seed):
@@ -1908,8 +1911,7 @@ def paper_preset(config_class):
 def natural(text, least=0):
     """argparse type: a whole number, 0 (or `least`) or more, of at most nine digits."""
     if not (text.isdecimal() and least <= int(text) < 10 ** 9):
-        raise argparse.ArgumentTypeError(f"expected a whole number, at least {least} and below "
-                                         f"10^9, found {text!r}")
+        raise argparse.ArgumentTypeError(f"expected at least {least}, below 10^9, found {text!r}")
     return int(text)
 
 
@@ -1961,8 +1963,7 @@ def make_parser():
     add("--model", required=True, help="an expert.npz or student.npz")
     add("--task", help="one of: " + ", ".join(TASKS) + " [the model's own]")
     add("--seed", type=natural, default=0, help="of the episodes [0]")
-    add("--record", action="store_true",
-        help="keep the returns in a .json file beside the model's, for distill")
+    add("--record", action="store_true", help="keep them in a .json beside the model, for distill")
     add("--episodes", type=positive, default=20, help="[20]")
     add("--workers", type=natural, help="processes that play episodes; 0: this one [cores]")
     add_config(sub, PlannerConfig)

@@ -381,7 +381,11 @@ def load(task, seed, case, students):
     path = Path(students) / f"{task}-{seed}" / "student.npz"
     fac.need(path.exists(), f"{path}: no such file; make it with 'python fac_tdmpc_ref.py distill "
              f"--task {task} --seed {seed}', or name the folder above with --students")
-    return fac.load_model(path, ["student"])
+    model, header = fac.load_model(path, ["student"])
+    own = header.get("data", [None])[0]  # its expert's checksum
+    fac.need(own in (None, data_checksums(task)[0]), f"{path}: another expert's student than "
+             f"data/{task}/expert.npz, beside which it would stand; copy its own there")
+    return model, header
 
 
 def planning_runs(args, variants):

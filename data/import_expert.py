@@ -43,7 +43,7 @@ MAX_WEIGHTS = 1 << 25
 MAX_RANK = 8
 MAX_NOISE = 0.5  # largest deviation of the noise on collected actions
 LEAST_EPISODES = 20  # distill holds out one in 20
-RESAVE = "torch.load it with weights_only=True and torch.save its state dict alone"
+RESAVE = "torch.load it where it was made and torch.save its state_dict() alone"
 ELSEWHERE = "only TD-MPC's official state dicts, for state input, can be imported"
 
 
@@ -81,7 +81,7 @@ def read_zip(path):
     except (fac.UserError, MemoryError):
         raise
     except Exception as error:  # a damaged file can raise nearly anything
-        raise fac.UserError(f"not a readable zip archive ({short(error)})") from None
+        raise fac.UserError(f"not a readable zip archive ({short(error)}); incomplete?") from None
     return found
 
 
@@ -134,7 +134,7 @@ CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()
 def read_pt(path):
     """What torch.save wrote: {name: array, or a dict of them}."""
     with open(path, "rb") as file:
-        need(file.read(2) == b"PK", f"no zip: older than PyTorch 1.6, or not PyTorch's; {RESAVE}")
+        need(file.read(2) == b"PK", f"no zip: empty, older than PyTorch 1.6, or not its; {RESAVE}")
     members = read_zip(path)
     roots = [n[:-8] for n in members if re.fullmatch(r"([^/]+/)?data\.pkl", n)]
     need(len(roots) == 1, f"expected one data.pkl, found {len(roots)}; {RESAVE}")
@@ -367,11 +367,13 @@ def widened(value):
 def find_replay(path, sizes):
     """What replay.npz needs, from an .npz that holds it in any precision."""
     with reading(path, (".npz",)) as found:
-        rows = found["continues"].size if "continues" in found else 0
+        for key in ("observation", "action", "continues"):
+            need(key in found, f"{key}: not there, only {', '.join(map(short, found))}")
+        rows = found["continues"].size
         for key, kind, shape in (("continues", "bool", (rows,)),
                                  ("observation", "float", (rows, sizes.dim_obs)),
                                  ("action", "float", (rows, sizes.dim_action))):
-            have = f"{found[key].dtype} {found[key].shape}" if key in found else "nothing"
+            have = f"{found[key].dtype} {found[key].shape}"
             need(have.startswith(kind) and found[key].shape == shape,
                  f"{key}: expected {kind} {shape}, found {have}")
         continues = found["continues"]

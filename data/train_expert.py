@@ -634,7 +634,7 @@ def make_parser():
     add("--refresh", type=positive, default=25, help="decisions that an episode goes on with the "
         "same weights [D6] [25]")
     add("--workers", type=positive, default=max(1, fac.cores() - 1), help="processes that play "
-        "them while this one learns [cores - 1]")
+        "them while this one learns [cores - 1, at least 1]")
     add("--minutes", type=float, default=0, help="stop after the round under way by then; 0: "
         "never [0]")
     add("--resume", action="store_true", help="insist on a checkpoint in --out")

@@ -280,7 +280,7 @@ def refused(done, *parts, program="fac_tdmpc_ref.py"):
     (["--replay", "{files}/walker.npz"], ["walker.npz", "(24, 6)", "(8, 3)"]),
     (["--replay", "{files}/expert.npz"], ["expert.npz", "kind", "'expert'"]),
     (["--expert", "{files}/replay.npz"], ["replay.npz", "kind", "'replay'"]),
-    (["--expert", "{files}/spoilt.npz"], ["spoilt.json", "record anew"]),  # before it distils
+    (["--expert", "{files}/spoilt.npz"], ["spoilt.json", "delete it"]),  # before it distils
     (["--out", "{files}/corrupt.npz"], ["corrupt.npz", "can't be read or written"]),
     (["--out", "{files}/corrupt.npz/below"], ["corrupt.npz", "can't be read or written"]),
 ])
@@ -573,7 +573,8 @@ def test_a_finished_run_is_not_replaced_by_one_with_other_settings(distilled, fi
     arguments = distill_arguments(files, "--lr", "1e-4", "--out", folder)
     assert fac.main([str(a) for a in arguments]) == 2
     message = capsys.readouterr().err.splitlines()[-1]
-    assert "student.npz: a run with other settings (lr: expected 0.0001, found 0.001)" in message
+    assert ("student.npz: a run with other settings (distill: lr: expected 0.0001, found 0.001)"
+            in message)
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
@@ -730,7 +731,7 @@ def test_a_record_counts_for_its_own_weights_planner_and_episodes_only(tmp_path)
 @pytest.mark.parametrize("text", ["{", "[3]", '"x"', '{"a": 1}', '{"a": ["x"]}'])
 def test_a_spoilt_record_is_named(tmp_path, text):
     (tmp_path / "expert.json").write_text(text)
-    with pytest.raises(fac.UserError, match="expert.json: not a file that evaluate --record wrote"):
+    with pytest.raises(fac.UserError, match="expert.json: not what evaluate --record writes"):
         fac.read_records(tmp_path / "expert.npz")
 
 
@@ -770,10 +771,24 @@ def test_the_readme_distils_an_expert_of_one_s_own(tmp_path, monkeypatch):
     arguments = command.replace("--collect 20", "--replay data.npz").split()[1:]
     assert import_expert.main(arguments) == 0
     *_, distil = re.findall(r"```python\n(.*?)```", text, re.S)
-    assert "own_episodes=0" in distil
+    class Robot:
+        """Another robot: of walker-walk's sizes."""
+        reset = staticmethod(lambda seed: np.full(24, seed % 2))
+        step = staticmethod(lambda action: (np.zeros(24), float(action[0])))
+
+    for words, few in (("dim_obs=4, dim_action=2", "dim_obs=24, dim_action=6"), ("1020", "1001"),
+                       ("DistillConfig()", "DistillConfig(horizon=2, steps=4, own_episodes=1)"),
+                       ("PlannerConfig()", "PlannerConfig(samples=4, iterations=1)")):
+        assert words in distil
+        distil = distil.replace(words, few)
     _, arrays = fac.read_npz("mine/replay.npz", ("replay",))
-    exec(distil.replace("own_episodes=0", "own_episodes=0, horizon=2, steps=2"),
-         {"fac": fac, "o": arrays["observation"], "a": arrays["action"], "c": arrays["continues"]})
+    weights = torch.load("model.pt")["model"]
+    exec(distil, found := {
+        "fac": fac, "weights": weights, "o": arrays["observation"], "a": arrays["action"],
+        "c": arrays["continues"], "robot": Robot})
+    assert len(found["losses"]) == 4 and found["returns"].shape == (1,)
+    np.testing.assert_array_equal(found["expert"].params["_pi.0.bias"][0, :, 0],
+                                  weights["_pi.0.bias"])
     student, header = fac.load_model("mine/student.npz")
     assert (student.config.num_agents, student.config.dim_action) == (6, 6)
-    assert fac.made_for(header, "student.npz") == {"horizon": 2}
+    assert fac.made_for(header, "student.npz") == {"discount": 0.99, "horizon": 2}

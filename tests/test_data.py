@@ -119,6 +119,14 @@ def test_agents_are_stored_with_a_leading_axis(tmp_path):
     assert arrays["_Q2.1.weight"].shape == arrays["_Q2.0.bias"].shape == (3, 11)
 
 
+def test_weights_without_their_axes_are_not_saved(tmp_path):
+    model = make_model()
+    model.params["_Q1.0.bias"] = model.params["_Q1.0.bias"][..., 0]
+    with pytest.raises(fac.UserError, match=r"_Q1.0.bias: expected \(N, rows, columns\), found"):
+        fac.save_model(tmp_path / "m.npz", model, {"kind": "expert"})
+    assert not list(tmp_path.iterdir())
+
+
 # read_npz -----------------------------------------------------------------------------
 
 

@@ -450,7 +450,7 @@ def test_a_disturbed_robot():
     np.testing.assert_array_equal(step("noise", full), step("noise", 0 * full))  # unheard
 
 
-def test_figures_7_and_8_plan_with_both_models(tmp_path, monkeypatch):
+def test_figures_7_and_8_plan_with_both_models(tmp_path, monkeypatch, capsys):
     pytest.importorskip("joblib")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(experiments, "BUDGETS", [(8, 1), (4, 1)])
@@ -465,6 +465,11 @@ def test_figures_7_and_8_plan_with_both_models(tmp_path, monkeypatch):
     monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: seen.extend(runs))
     assert experiments.main(["figure8", *flags]) == 0
     assert len(seen) == 2 * (1 + 3 * 3)
+    for data, status in ((experiments.data_checksums("reacher-hard"), 0), ([1, 2, None], 2)):
+        fac.save_model("runs/reacher-hard-0/student.npz", random_model(), {
+            "kind": "student", "data": data})
+        assert experiments.main(["figure8", *flags]) == status
+    assert "student.npz: another expert's student" in capsys.readouterr().err
 
 
 def test_a_run_made_with_other_defaults_is_another_run(monkeypatch):

@@ -334,14 +334,16 @@ def test_workers_end_with_their_parent(blow, tmp_path):
     assert shared_memory() == before
 
 
-def test_an_unguarded_script_gets_an_error_not_a_hang(tmp_path):
+@pytest.mark.parametrize("hidden", [16, 400])  # in one piece through a pipe, and not
+def test_an_unguarded_script_gets_an_error_not_a_hang(tmp_path, hidden):
     script = tmp_path / "plan.py"
     script.write_text(f"import sys\nsys.path[:0] = [{str(fac.DATA.parent)!r}, "
                       f"{os.path.dirname(os.path.abspath(__file__))!r}]\n"
                       "import fac_tdmpc_ref as fac\nfrom test_planning import random_model\n"
-                      "fac.Planner(random_model(hidden=400), workers=1)\n")
+                      f"fac.Planner(random_model(hidden={hidden}), workers=1)\nprint('made')\n")
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60)
     assert done.returncode != 0 and "__main__" in done.stderr
+    assert "made" not in done.stdout  # a planner that is made has workers that are ready
 
 
 def refuses(connection):
