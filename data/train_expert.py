@@ -30,8 +30,8 @@ from numpy_learner import ExpertConfig, Learner, named, restore  # noqa: E402
 # for a few cores; hidden layers of 512, as in Table 2, make an update three times as dear
 TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
 # settings of distill that say nothing where an expert still learns
-NOT_ONLINE = ("steps", "batch_size", "reuse", "own_episodes", "held_out")
-FOLLOWING_DEFAULTS = {"noise_samples": 3, "own_episodes": 0}  # a share of each round instead
+NOT_ONLINE = ("steps", "reuse", "own_episodes", "held_out")
+FOLLOWING_DEFAULTS = {"own_episodes": 0}  # as many as the expert plays instead, each round
 TORCH_ONLY = {"device": None, "precision": "float32", "threads": 1}  # and their defaults
 FINGER_RADIUS, REACHER_LINK = 0.01, 0.09  # of data/reacher.xml, metres
 LOSSES = ("consistency", "reward", "value", "kl_reward", "kl_value")
@@ -213,7 +213,7 @@ def make_learner(args, sizes, config):
 
 
 class OnlineStudent:
-    """Appendix C.1: Algorithm 1 on the batches, and with the expert, of a training that goes on.
+    """Appendix C.1: Algorithm 1 with an expert that goes on learning, on states of its batches.
 
     own: a ReplayBuffer of episodes that it played; once there are any, a share of its states is
     from them [D8].
@@ -225,10 +225,11 @@ class OnlineStudent:
         self.optimizer, self.model = fac.new_student(expert, sizes, seed)
 
     def update(self, expert, obs, actions):
-        """One step of Algorithm 1 on observations (O, B) and actions (H, A, B); its divergences."""
+        """One step of Algorithm 1 on the first `batch_size` of observations (O, B) and actions
+        (H, A, B); its divergences."""
         config, t, L = self.config, self.optimizer.t, self.config.horizon + 1
-        rng = fac.stream(self.seed, "perturbations", t)
-        actions = np.repeat(actions[:L, ..., None], config.noise_samples, -1)
+        rng, obs = fac.stream(self.seed, "perturbations", t), obs[:, :config.batch_size]
+        actions = np.repeat(actions[:L, :, :config.batch_size, None], config.noise_samples, -1)
         if len(self.own):
             mine = slice(int(config.own_share * obs.shape[1]))
             found, played, *_ = self.own.sample(rng, mine.stop, L)
@@ -348,12 +349,13 @@ class Training:
         return {"explorer": (model, planning), **own}
 
     def explorations(self):
-        """A round's training episodes, then the student's own, as `Actors.begin` takes them."""
+        """A round's training episodes, then as many of the student's own, as `Actors.begin` takes
+        them."""
         first, std = self.decisions // fac.EPISODE_STEPS, self.scheduled()["exploration_std"]
-        share = self.student.config.own_share if self.student and not self.warming else 0
+        follows = self.student and self.student.config.own_share and not self.warming
         return [(seed, player, deviation) for use, player, deviation, count in (
             ("training episode", "explorer", std, self.args.envs),
-            ("own episode", "own", 0.0, int(np.ceil(share * self.args.envs))))
+            ("own episode", "own", 0.0, self.args.envs if follows else 0))
             for seed in fac.training_seeds(self.args.seed, use, first, count)]
 
     def planners(self):
@@ -371,7 +373,7 @@ class Training:
         return [(seed, name) for name in self.models for seed in seeds]
 
     def learn(self):
-        """One update of the expert and, on the same batch, one of the student; their LOSSES."""
+        """One update of the expert and, on its batch, one of the student; their LOSSES."""
         config, updates, H = self.config, self.learner.updates, self.config.horizon
         rng = fac.stream(self.args.seed, "update", updates)
         steps = max(H, self.student.config.horizon + 1) if self.student else H
@@ -510,6 +512,8 @@ def read_settings(args):
     _, _, _, dim_action = fac.lookup_task(args.task)
     if not args.student:
         return config, planning, None
+    fac.need(distilling.batch_size <= config.batch_size, f"--distill-batch-size "
+             f"{distilling.batch_size}: at most --batch-size ({config.batch_size}), the expert's")
     args.num_agents = dim_action if args.num_agents is None else args.num_agents
     updates = max(1, int(config.updates_per_step * args.steps))
     return config, planning, dataclasses.replace(distilling, steps=updates)
@@ -623,7 +627,7 @@ def make_parser():
         "each; a run that is over goes on with more [30000]")
     add("--seed", type=natural, default=0, help="[0]")
     add("--student", choices=("fac",), help="fac: after each update of the expert, one of a "
-        "factored student on the same batch")
+        "factored student on states of its batch")
     add("--num-agents", type=int, help="the student's N [dim(A)]")
     add("--backend", choices=("numpy", "torch"), default="numpy", help="what learns [numpy]")
     add("--device", help="torch: cpu or cuda [cuda where there is one]")

@@ -21,7 +21,8 @@ SCRIPT = ROOT / "data" / "train_expert.py"
 TINY = ["--task", "reacher-easy", "--steps", "3000", "--envs", "2", "--seed-decisions", "1000",
         "--updates-per-step", "0.01", "--batch-size", "8", "--mlp-dim", "16", "--enc-dim", "8",
         "--latent-dim", "6", "--plan-samples", "8", "--plan-iterations", "1", "--evaluate-every",
-        "2000", "--evaluate-episodes", "1", "--student", "fac", "--workers", "1", "--episodes", "0"]
+        "2000", "--evaluate-episodes", "1", "--distill-batch-size", "8", "--student", "fac",
+        "--workers", "1", "--episodes", "0"]
 
 
 def train(*arguments, cwd):
@@ -184,14 +185,14 @@ def test_train_prints_json_and_writes_what_distill_takes(trained, tmp_path):
 
 
 def test_the_student_plays_beside_the_expert(trained, tmp_path):
-    """An episode a round once it learns (two envs, a quarter, rounded up); none without a share."""
+    """As many a round, once it learns, as the expert, two; none without a share."""
     def played(folder):
         header, arrays = fac.read_npz(folder / "checkpoint.npz", ("checkpoint",))
         assert arrays["count"] == 6 and header["settings"]["distill"]["own_episodes"] == 0
         assert arrays["own action"].shape == (arrays["own count"], fac.EPISODE_STEPS, 3)
         return arrays["own count"]
 
-    assert played(trained[1]) == 2
+    assert played(trained[1]) == 4
     succeeded(train("--distill-own-share", "0", "--out", "none", cwd=tmp_path))
     assert played(tmp_path / "none") == 0
 
@@ -203,13 +204,13 @@ def test_a_share_of_an_online_student_s_states_is_its_own(monkeypatch):
     for key, value in expert.params.items():
         value *= not key.startswith("_pi")
     own, seen = train_expert.ReplayBuffer(8, 3, fac.EPISODE_STEPS), []
-    config = fac.DistillConfig(noise_samples=50, own_share=0.25, own_episodes=0)
+    config = fac.DistillConfig(batch_size=16, noise_samples=50, own_share=0.25, own_episodes=0)
     student = train_expert.OnlineStudent(expert, 3, config, 0, own)
     real = fac.perturbed_batch
     monkeypatch.setattr(fac, "perturbed_batch",
                         lambda *args: seen.append((args[2], args[3])) or real(*args))
     for _ in range(2):
-        student.update(expert, np.ones((8, 16), np.float32), np.ones((5, 3, 16), np.float32))
+        student.update(expert, np.ones((8, 20), np.float32), np.ones((5, 3, 20), np.float32))
         own.add(*(np.full_like(x, 2) for x in episode(np.random.default_rng(0), 2)))
     (obs, actions), (mixed, both) = seen
     assert (obs == 1).all() and actions.shape == (4, 3, 16, 50) and (actions == 1).all()
@@ -274,7 +275,7 @@ def test_another_run_s_files_are_not_replaced(tmp_path, name):
     (["--num-agents", "2"], ["[1, 3]"]),
     (["--num-agents", "0"], ["[1, 3]"]),
     (["--std-start", "3"], ["std_start", "2.0"]),
-    (["--distill-batch-size", "3"], ["--distill-batch-size"]),
+    (["--distill-batch-size", "9"], ["--distill-batch-size 9", "at most", "(8)"]),
     (["--out", fac.__file__], ["can't be read or written"]),
     (["--out", "x" * 300], ["can't be read or written"]),
     (["--evaluate-every", "0"], ["evaluate"]),
