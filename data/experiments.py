@@ -381,11 +381,7 @@ def load(task, seed, case, students):
     path = Path(students) / f"{task}-{seed}" / "student.npz"
     fac.need(path.exists(), f"{path}: no such file; make it with 'python fac_tdmpc_ref.py distill "
              f"--task {task} --seed {seed}', or name the folder above with --students")
-    model, header = fac.load_model(path, ["student"])
-    own = header.get("data", [None])[0]  # its expert's checksum
-    fac.need(own in (None, data_checksums(task)[0]), f"{path}: another expert's student than "
-             f"data/{task}/expert.npz, beside which it would stand; copy its own there")
-    return model, header
+    return fac.load_model(path, ["student"])
 
 
 def planning_runs(args, variants):
@@ -394,6 +390,10 @@ def planning_runs(args, variants):
     for task, (case, seed) in itertools.product(
             args.tasks, [("expert", 0), *(("student", seed) for seed in args.seeds)]):
         model, header = load(task, seed, case, args.students)
+        if case == "expert":
+            expert = fac.checksum(model.params.values())  # as its students' files name it
+        fac.need(header.get("data", [expert])[0] == expert, f"{args.students}/{task}-{seed}/student"
+                 f".npz: another expert's student than data/{task}/expert.npz; copy its own there")
         weights = fac.record_key(model, planning_for(header, {}), 0)  # and the planner
         runs += [make_run(task, seed, case, episodes=args.episodes, weights=weights, **variant)
                  for variant in variants(task)]
