@@ -672,7 +672,7 @@ class Distiller:
     computed once and learned from `reuse` times. Two threads share that, and each step's batch:
     NumPy lets go of the interpreter inside its products. sizes: in place of `student_config`'s."""
 
-    loss = staticmethod(distill_loss)  # a subclass may have another, as Figure 5's MSE has
+    loss, perturb = staticmethod(distill_loss), staticmethod(perturbed_batch)  # or a subclass's own
 
     def __init__(self, expert, replay, config, num_agents=None, seed=0, **sizes):
         theirs = expert.config
@@ -709,7 +709,7 @@ class Distiller:
             seen, played = np.split(self.own[episode, t].swapaxes(1, 2).astype(F32), [dim_obs], 1)
             obs[:, is_own] = seen[0]  # of (L, O, count)
             actions[:, :, is_own] = own_actions(self.expert, seen[0], played, K, rng)
-        return perturbed_batch(self.expert, self.student, obs, actions, self.config, rng)
+        return self.perturb(self.expert, self.student, obs, actions, self.config, rng)
 
     def batch(self, t):
         """Step t's part of its pool, which is gone through `reuse` times, in another order each:
@@ -810,8 +810,8 @@ def rank_correlation(distiller, states, discount=0.99):
     student, config = distiller.student, dataclasses.replace(distiller.config, noise_samples=32)
     obs, actions = distiller.replay.sequences(starts, config.horizon + 1)
     with one_thread():
-        x, actions, expert = perturbed_batch(distiller.expert, student, obs, actions[..., None],
-                                             config, rng)
+        x, actions, expert = distiller.perturb(distiller.expert, student, obs, actions[..., None],
+                                               config, rng)
         found = predict(student, student.encode_features(x), actions)
     return (spearman(expert[1] + expert[2], found[1] + found[2]).mean(-1),
             spearman(*(horizon_returns(*out, discount) for out in (expert, found))).mean(-1))

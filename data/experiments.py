@@ -8,7 +8,7 @@
 Figures 4, 5, 7, 8, 12, 13, departures and `sweep` are lists of runs, each a task, a seed, a case
 and settings. Rows go to one CSV under data/results as runs end; the same command again makes those
 that are missing. `report` draws all but sweeps, from CSVs and the experts' records. Table 3 is in
-speed.py, TAP in tap.py, section 5.6 in look.py: clients, of which fac_tdmpc_ref.py knows nothing.
+speed.py, section 5.6 in look.py, what is distilled in other ways in baselines.py.
 """
 import contextlib
 import csv
@@ -22,7 +22,6 @@ import os
 import re
 import sys
 import time
-from collections import defaultdict
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
@@ -30,6 +29,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import fac_tdmpc_ref as fac  # noqa: E402
+from baselines import DecodingEnvironment, distiller_of  # noqa: E402
 from look import command_agreement, command_figure9, command_watch  # noqa: E402
 from speed import ROBOTS, command_table3  # noqa: E402
 
@@ -114,8 +114,11 @@ def attempt(function, run, home):
     began = time.time()
     with fac.one_thread():
         try:
-            found = list(function(run["task"], int(run["seed"]), run["case"],
-                                  json.loads(run["settings"])))
+            settings = json.loads(run["settings"])
+            fac.need(settings.get("data") == made_from(run["task"], settings),
+                     f"data/{run['task']} or a default has changed since")
+            settings.pop("data", None)
+            found = list(function(run["task"], int(run["seed"]), run["case"], settings))
             found[-1].setdefault("minutes", (time.time() - began) / 60)
         except Exception as error:
             found = [{"error": f"{type(error).__name__}: {' '.join(str(error).split())}"}]
@@ -183,79 +186,9 @@ def measure(model, task, planning, count, environment=None):
 
 # ------------------------------------------------- Figures 4, 5, 13 and sweeps: distillation
 
-def squared_error(student, expert, *_):
-    """Mean of (student - expert)^2 over the K predictions and its gradient: MSE for `soft_kl`."""
-    error = student - expert
-    return (error ** 2).mean(-1), 2 * error / error.shape[-1]
-
-
-class MSEDistiller(fac.Distiller):
-    """Figure 5: values, not rankings."""
-
-    loss = staticmethod(functools.partial(fac.distill_loss, divergence=squared_error))
-
-
-def consistency_loss(student, features, actions, targets, config, grads=None):
-    """Equation 4 and, with weight 2 (TD-MPC's; Table 2 has 0), TD-MPC's consistency.
-
-    That is the mean of |s_{h+1} - f_E(g_{h+1})|^2 over features, with the student's encoding,
-    held fixed, of the last of `targets`: what the student reads of the expert's own rollout."""
-    *targets, after = targets  # (L, B, K, F)
-    tapes, encoder_tape, weight = defaultdict(list), [], 2.0
-    loss, *means = fac.distill_loss(student, features, actions, targets, config, grads)
-    z = student.encode_features(features, encoder_tape)
-    L, _, B, K = actions.shape
-    x, end = fac.unroll(student, z, actions, L, tapes)
-    n, m = student.config.num_agents, student.config.latent_dim
-    own = np.concatenate([x[:, :m, B * K:], end], 2)
-    goal = student.encode_features(np.ascontiguousarray(after.reshape(1, -1, after.shape[-1])
-                                                        .swapaxes(1, 2)))
-    lam = np.repeat(config.lam ** np.arange(L), B * K).astype(z.dtype)
-    gap, scale = own - goal, weight / (n * m * B * K)
-    if grads is not None:
-        d_latents = (2 * scale * lam * gap).reshape(n, m, L, -1).transpose(2, 0, 1, 3)
-        outputs = fac.run_heads(student, x, actions, tapes)
-        dz = fac.predict_backward(student, tapes, [np.zeros_like(y) for y in outputs], grads,
-                                  d_latents)
-        fac.backward(fac.ENCODER, student.params, "_encoder", encoder_tape,
-                     dz.reshape(1, -1, B), grads)
-    return loss + float(scale * (lam * gap ** 2).sum()), *means
-
-
-class ConsistentDistiller(fac.Distiller):
-    """Figure 5: with TD-MPC's consistency loss, along the expert's own rollout."""
-
-    loss = staticmethod(consistency_loss)
-
-    def draw(self, number, part, size):
-        """As Distiller's; the targets are followed by the expert's latents (L, B, K, F)."""
-        features, actions, targets = super().draw(number, part, size)
-        steps, _, *columns = actions.shape
-        x, end = fac.unroll(self.expert, features, actions, steps)
-        after = np.concatenate([x[:, :features.shape[1], np.prod(columns):], end], 2)[0]
-        return features, actions, [*targets, after.T.reshape(steps, *columns, -1)]
-
-
-def small_distiller(expert, replay, config, _, seed):
-    """B.2's 10% TD-MPC: centralized, hidden layers of 66 (3% of the weights behind the encoder)."""
-    return fac.Distiller(expert, replay, config, 1, seed, mlp_dim=66)
-
-
-def distiller_of(case):
-    """What learns in a case of Figure 4 or 5; most differ from the default by settings alone."""
-    if case == "TAP":
-        from tap import TapDistiller
-        return TapDistiller
-    return {"MSE": MSEDistiller, "consistency": ConsistentDistiller,
-            "10% TD-MPC": small_distiller}.get(case, fac.Distiller)
-
-
 def distil(task, seed, case, settings):
     """Distil a student; a row at each evaluation. settings: of DistillConfig, and `num_agents`,
-    `evaluations` on the way, of so many `episodes`, planned with `samples` and `iterations`;
-    `data`: checksums, which tell apart what it is learned from."""
-    data = settings.pop("data", None)
-    fac.need(data in (None, data_checksums(task)), f"data/{task} or a default has changed since")
+    `evaluations` on the way, of so many `episodes`, planned with `samples` and `iterations`."""
     own = {k: settings.pop(k, v) for k, v in (("num_agents", None), ("evaluations", 1),
                                               ("episodes", 10))}
     about = {k: settings.pop(k) for k in ("samples", "iterations") if k in settings}
@@ -267,7 +200,6 @@ def distil(task, seed, case, settings):
     playing = dataclasses.replace(planning, **fac.OWN_BUDGET)
     student, environment = distiller.student, None
     if case == "TAP":  # whose actions are others
-        from tap import DecodingEnvironment
         environment = DecodingEnvironment(task, expert, distiller.vae)
 
     def play_own(first, count):
@@ -316,7 +248,21 @@ def data_checksums(task):
     """Of a task's expert and replay, as a student's file names them; of the defaults."""
     expert, _ = fac.load_model(fac.data_file(task, "expert.npz"))
     return [*fac.data_checksums(expert, fac.Replay(fac.data_file(task, "replay.npz"))),
-            fac.zlib.crc32(repr((fac.DistillConfig(), fac.PlannerConfig())).encode())]
+            crc(fac.DistillConfig(), fac.PlannerConfig())]
+
+
+def crc(*settings):
+    """A number that tells settings apart."""
+    return fac.zlib.crc32(repr(settings).encode())
+
+
+def made_from(task, settings):
+    """What the `data` of a run's settings would be now; None if they name none."""
+    if settings.get("data") is None:
+        return None
+    if settings.get("decisions"):
+        return online(task, 0, settings["decisions"], settings["episodes"])[1]
+    return data_checksums(task)
 
 
 def command_figure13(args):
@@ -394,16 +340,24 @@ def planning_runs(args, variants):
             expert = fac.checksum(model.params.values())  # as its students' files name it
         fac.need(header.get("data", [expert])[0] == expert, f"{args.students}/{task}-{seed}/student"
                  f".npz: another expert's student than data/{task}/expert.npz; copy its own there")
-        weights = fac.record_key(model, planning_for(header, {}), 0)  # and the planner
-        runs += [make_run(task, seed, case, episodes=args.episodes, weights=weights, **variant)
-                 for variant in variants(task)]
+        runs += [make_run(task, seed, case, episodes=args.episodes, **identity(model, header),
+                          **variant) for variant in variants(task)]
     return runs
+
+
+def identity(model, header):
+    """What a run's settings say of its model: its weights; how it was made, as seeds share it."""
+    planning = planning_for(header, {})
+    return {"weights": fac.record_key(model, planning, 0), "made": crc(
+        header.get("distill"), model.config.num_agents, planning)}
 
 
 def plan_with(task, seed, case, settings, students):
     """The returns of a model: with its file's planning but for `samples` and `iterations`, on a
     robot that `joint` and `kind` disturb. students: a folder, see `load`."""
     model, header = load(task, seed, case, students)
+    fac.need(identity(model, header).items() <= settings.items(), f"{students}: {task}'s {case} "
+             "has changed meanwhile")
     planning = planning_for(header, settings)
     environment = (DisturbedEnvironment(task, settings["joint"], settings["kind"])
                    if settings.get("kind") else None)
@@ -481,27 +435,34 @@ def command_figure8(args):
 
 # ---------------------------------------------------------- Figure 12: distilling on the way
 
+def online(task, seed, decisions, episodes):
+    """train_expert.py's arguments for a run of Figure 12; a number for all that they set."""
+    import train_expert
+    args = train_expert.make_parser().parse_args([
+        "--task", task, "--seed", str(seed), "--student", "fac", "--steps", str(decisions),
+        "--workers", "1", "--episodes", "0", "--evaluate-episodes", str(episodes),
+        "--out", f"runs/online-{task}-{seed}-{decisions}-{episodes}"])
+    return args, crc(train_expert.read_settings(args), args.envs, args.refresh, args.evaluate_every)
+
+
 def follow(task, seed, case, settings):
     """train_expert.py --student fac: rows of the student's and the expert's returns."""
-    import train_expert
-    out = f"runs/online-{task}-{seed}-{settings['decisions']}-{settings['episodes']}"
-    args = train_expert.make_parser().parse_args([
-        "--task", task, "--seed", str(seed), "--student", "fac", "--out", out, "--workers", "1",
-        "--steps", str(settings["decisions"]), "--episodes", "0",
-        "--evaluate-episodes", str(settings["episodes"])])
-    train_expert.train(args)
-    with open(Path(out) / "curve.csv", newline="", encoding="utf-8") as file:
+    args, _ = online(task, seed, **settings)
+    args.run(args)
+    with open(Path(args.out) / "curve.csv", newline="", encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if row["eval_student"]]
     for row in rows:
+        over = {"minutes": float(row["seconds"]) / 60} if row is rows[-1] else {}
         yield {"step": row["decisions"], "return_mean": float(row["eval_student"]),
-               "expert_mean": float(row["eval_expert"])}
+               "expert_mean": float(row["eval_expert"]), **over}
 
 
 def command_figure12(args):
     """figure12: online distillation (C.1)."""
     fac.need(args.decisions % 2000 == 0, f"--decisions: a multiple of 2000, not {args.decisions}")
+    about = {"decisions": args.decisions, "episodes": args.episodes}
     return run_all(args, follow, [
-        make_run(task, seed, "online", decisions=args.decisions, episodes=args.episodes)
+        make_run(task, seed, "online", data=online(task, seed, **about)[1], **about)
         for seed, task in itertools.product(args.seeds, args.tasks)])
 
 
@@ -517,18 +478,23 @@ AUTHORS = {
     "humanoid-walk": (458, 227, 724, 789)}
 METHODS = ("10% TD-MPC", "TAP", "100% TD-MPC", "Fac-TDMPC")
 CASES = [*METHODS, *FIGURE5_CASES]
+BUDGET = ("data", "steps", "evaluations", "episodes", "samples", "iterations", "decisions")
 
 
 def settled(path, but=()):
-    """A CSV's finished runs; UserError if those of one task and case were made with other settings
-    than `but`, or of one seed with other students: they don't belong in one figure."""
+    """A CSV's finished runs; UserError if they don't belong in one figure: a seed's were made with
+    other students, a case's with other settings than `but`, a task's with another budget."""
     rows, seen = finished(read_rows(path)), {}
     for task, seed, case, settings in rows:
         about = {k: v for k, v in json.loads(settings).items() if k not in but}
-        for which, found in ((seed, about.pop("weights", None)), (None, about)):
-            other = seen.setdefault((task, which, case), found)
+        weights, budget = about.pop("weights", None), {k: about.get(k) for k in BUDGET}
+        for key, found in (((seed, case), weights), ((case,), about), ((), budget)):
+            other = seen.setdefault((task, *key), found)
             fac.need(other == found, f"{path}: {case} of {task} was made with {other} and, seed "
                      f"{seed}, with {found}; delete the rows that are of no use")
+    for task, budget in ((key[0], found) for key, found in seen.items() if len(key) == 1):
+        if budget["data"] != made_from(task, budget):
+            print(f"{path}: {task} was made with other data or defaults than now", file=sys.stderr)
     return rows
 
 

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import baselines
 import experiments
 import fac_tdmpc_ref as fac
 import look
 import speed
-import tap
 import test_cli
 import train_expert
 from test_cli import BLOCKED, ONE_THREAD, ROOT, last_json, launch, write_expert
@@ -288,7 +288,7 @@ def test_every_method_of_figure_4_learns_and_plans():
     """Rows at each evaluation; 10% TD-MPC has few weights; TAP plans latent actions."""
     weights = {}
     for case, settings in experiments.FIGURE4.items():
-        kind = experiments.distiller_of(case)
+        kind = baselines.distiller_of(case)
         expert, _ = fac.load_model(fac.data_file("cheetah-run", "expert.npz"))
         replay = fac.Replay(fac.data_file("cheetah-run", "replay.npz"))
         config = fac.DistillConfig(steps=2, batch_size=2, own_episodes=0)
@@ -317,11 +317,11 @@ def loss_inputs(dtype=np.float64):
             [*targets, rng.standard_normal((3, 4, 3, 4))])
 
 
-@pytest.mark.parametrize("kind", [experiments.MSEDistiller, experiments.ConsistentDistiller])
+@pytest.mark.parametrize("kind", [baselines.MSEDistiller, baselines.ConsistentDistiller])
 def test_gradients_of_the_other_losses(kind, monkeypatch):
     student, features, actions, targets = loss_inputs()
     config = fac.DistillConfig(horizon=2, lam=0.7)
-    targets = targets[:3] if kind is experiments.MSEDistiller else targets
+    targets = targets[:3] if kind is baselines.MSEDistiller else targets
     grads = {k: np.zeros_like(v) for k, v in student.params.items() if k[:7] != "_expert"}
     kind.loss(student, features, actions, targets, config, grads)
     encode = student.encode_features  # the goals, of 3 * 4 * 3 columns, are held fixed
@@ -347,6 +347,7 @@ def test_a_figure12_run_counts_as_finished_by_its_last_row_alone(tmp_path, monke
     rows = experiments.attempt(experiments.follow, run, os.getpid())
     assert [(row["step"], row["return_mean"], row["expert_mean"]) for row in rows] == [
         ("2000", 4.0, 5.0), ("6000", 6.0, 7.0)]
+    assert rows[-1]["minutes"] == 3 / 60  # of all its stretches
     for count in (1, 2):
         experiments.append_rows(path := tmp_path / f"{count}.csv", rows[:count])
         assert len(experiments.finished(experiments.read_rows(path))) == count - 1
@@ -357,7 +358,7 @@ def test_consistency_vanishes_where_the_student_follows_the_expert():
     student, features, actions, targets = loss_inputs()
     config = fac.DistillConfig(horizon=2, lam=0.5)
     base = fac.distill_loss(student, features, actions, targets[:3], config)[0]
-    found = experiments.consistency_loss(student, features, actions, targets, config)[0]
+    found = baselines.consistency_loss(student, features, actions, targets, config)[0]
     z, expected = np.repeat(student.encode_features(features), 3, 2), 0.0
     for h in range(3):
         a = actions[h].reshape(2, 1, 12)
@@ -368,7 +369,7 @@ def test_consistency_vanishes_where_the_student_follows_the_expert():
 
 
 def small_vae(dtype=np.float64):
-    return tap.ActionVAE(4, 3, np.random.default_rng(0), 8, dtype)
+    return baselines.ActionVAE(4, 3, np.random.default_rng(0), 8, dtype)
 
 
 def test_gradients_of_the_action_vae():
@@ -411,7 +412,7 @@ def test_the_action_vae_finds_a_plane():
         s = rng.uniform(-0.5, 0.5, (4, batch))
         return np.concatenate([s, s + plane @ rng.uniform(-1, 1, (2, batch))]).astype(np.float32)
 
-    vae = tap.ActionVAE(4, 4, rng)
+    vae = baselines.ActionVAE(4, 4, rng)
     vae.fit(draw, rng, 800, beta=1e-3)
     x = draw(64)
     u = vae.encode(x)
@@ -424,13 +425,19 @@ def test_tap_learns_from_the_robot_s_actions_of_its_own_episodes():
     expert, _ = fac.load_model(fac.data_file("reacher-hard", "expert.npz"))
     replay, rng = fac.Replay(fac.data_file("reacher-hard", "replay.npz")), np.random.default_rng(0)
     config = fac.DistillConfig(steps=8, batch_size=8)
-    with contextlib.closing(tap.TapDistiller(expert, replay, config, vae_steps=10)) as distiller:
+    distiller = baselines.TapDistiller(expert, replay, config, vae_steps=10)
+    with contextlib.closing(distiller):
         obs = rng.uniform(-1, 1, (2, fac.EPISODE_STEPS, 8))
         u = rng.uniform(-1, 1, (2, fac.EPISODE_STEPS, 2)).astype(np.float32)
         distiller.add(obs, u)
         s = expert.encode(obs[1, 7][:, None])[0]
         expected = distiller.vae.decode(s, u[1, 7][:, None])[:, 0]
         assert np.allclose(distiller.own[1, 7, 8:], expected, atol=1e-3)
+        z, u, targets = distiller.draw(0, 0, 4)  # these are for what the robot would do
+        s, u0 = np.repeat(z, config.noise_samples, 2), u[0].reshape(2, -1)
+        rewards = expert.reward(s, distiller.vae.decode(s[0], u0)[None])
+        assert u.shape == (4, 2, 4, config.noise_samples) and np.abs(u).max() <= 1
+        np.testing.assert_allclose(targets[0][0].ravel(), rewards[0], rtol=1e-4, atol=1e-5)
         assert np.isfinite(distiller.step()).all()
 
 
@@ -465,6 +472,9 @@ def test_figures_7_and_8_plan_with_both_models(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: seen.extend(runs))
     assert experiments.main(["figure8", *flags]) == 0
     assert len(seen) == 2 * (1 + 3 * 3)
+    row = experiments.attempt(functools.partial(experiments.plan_with, students="runs"), {
+        **seen[-1], "settings": seen[-1]["settings"].replace("weights ", "weights 1")}, 0)[-1]
+    assert row["error"] == "UserError: runs: reacher-hard's student has changed meanwhile"
     for data, status in ((experiments.data_checksums("reacher-hard"), 0), ([1, 2, None], 2)):
         fac.save_model("runs/reacher-hard-0/student.npz", random_model(), {
             "kind": "student", "data": data})
@@ -481,8 +491,13 @@ def test_a_run_made_with_other_defaults_is_another_run(monkeypatch):
         monkeypatch.setattr(fac, "PlannerConfig", config_class)
         assert experiments.main(["sweep", *flags]) == 0
     assert seen[0] == seen[1] != seen[2]
-    with pytest.raises(fac.UserError, match="data/reacher-hard or a default has changed since"):
-        next(experiments.distil("reacher-hard", 0, "sweep", json.loads(seen[0]["settings"])))
+    expected = "data/reacher-hard or a default has changed since"
+    assert expected in experiments.attempt(experiments.distil, seen[0], os.getpid())[-1]["error"]
+    settings = {"decisions": 4000, "episodes": 1}
+    before = experiments.made_from("walker-walk", {"data": 0, **settings})
+    monkeypatch.setitem(train_expert.FOLLOWING_DEFAULTS, "own_share", 0.5)
+    run = experiments.make_run("walker-walk", 0, "online", data=before, **settings)
+    assert "has changed since" in experiments.attempt(experiments.follow, run, 0)[-1]["error"]
 
 
 def test_departures_are_those_that_the_settings_name(monkeypatch):
@@ -497,22 +512,24 @@ def test_departures_are_those_that_the_settings_name(monkeypatch):
 
 
 def test_the_cases_of_figure_5_learn_what_they_say():
-    kinds = {case: experiments.distiller_of(case) for panel in experiments.FIGURE5.values()
+    kinds = {case: baselines.distiller_of(case) for panel in experiments.FIGURE5.values()
              for case in panel}
-    assert kinds.pop("MSE") is experiments.MSEDistiller
-    assert kinds.pop("consistency") is experiments.ConsistentDistiller
+    assert kinds.pop("MSE") is baselines.MSEDistiller
+    assert kinds.pop("consistency") is baselines.ConsistentDistiller
     assert set(kinds.values()) == {fac.Distiller} and len(kinds) == 6
 
 
-@pytest.mark.parametrize("seeds", [(0, 0), (0, 1)])
-def test_runs_of_other_settings_don_t_make_one_figure(tmp_path, seeds):
+@pytest.mark.parametrize("case, seed", [("TAP", 0), ("TAP", 1), ("10% TD-MPC", 0)])
+def test_runs_of_other_settings_don_t_make_one_figure(tmp_path, capsys, case, seed):
     path = tmp_path / "figure4.csv"
-    write_rows(path, [("walker-run", seed, "TAP", {"episodes": n, "weights": seed}, [
-        {"step": 1, "return_mean": 1.0, "minutes": 1.0}]) for n, seed in zip((5, 10), seeds)])
-    expected = rf"TAP of walker-run was made with .*, seed {seeds[1]}, with .*'episodes': 10"
+    write_rows(path, [("walker-run", at, what, {"episodes": n, "weights": at, "data": [1]}, [
+        {"step": 1, "return_mean": 1.0, "minutes": 1.0}]) for what, n, at in (
+            ("TAP", 5, 0), (case, 10, seed))])
+    expected = rf"{case} of walker-run was made with .*, seed {seed}, with .*'episodes': 10"
     with pytest.raises(fac.UserError, match=expected):
         experiments.settled(path)
     assert len(experiments.settled(path, ("episodes",))) == 2
+    assert "walker-run was made with other data or defaults than now" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("left", ["", "task,se"])
