@@ -71,6 +71,13 @@ def need(condition, message):
         raise UserError(message)
 
 
+def check_finite(values, update, lr):
+    """UserError if learning diverged, before its weights are saved."""
+    for name, value in values.items():
+        need(np.isfinite(value).all(), f"after update {update} the {name} no longer finite: "
+             f"learning diverged; lower the learning rate ({lr})")
+
+
 # ==== 1. Configuration ================================================================
 
 EPISODE_STEPS = 500  # T: decisions in an episode, 1000 control steps of dm_control
@@ -88,31 +95,32 @@ RANGE = {"least": ("at least {}", operator.ge), "above": ("above {}", operator.g
 
 
 class Settings:
-    """Base of the configs below: UserError for a value that its field rules out."""
+    """Base of the configs below: UserError for a type or a value that its field rules out."""
 
     def __post_init__(self):
         for f in dataclasses.fields(self):
-            value = getattr(self, f.name)
+            value, cls = getattr(self, f.name), type(f.default)
+            if np.dtype(type(value)).kind not in {int: "iu", float: "iuf", bool: "b"}.get(cls, "U"):
+                self.refuse(f.name, f"of type {cls.__name__}")
             rules = [(words.format(f.metadata[bound]), holds(value, f.metadata[bound]))
                      for bound, (words, holds) in RANGE.items() if bound in f.metadata]
-            if isinstance(value, float):
-                rules.append(("finite", np.isfinite(value)))
-            elif isinstance(value, int) and value > 10 ** 9:
+            if cls is float:
+                rules.append(("finite, as a float32", abs(value) < 3e38))
+            elif cls is int and value > 10 ** 9:
                 rules.append(("at most 10^9", False))
             if not all(holds for _, holds in rules):
                 self.refuse(f.name, " and ".join(words for words, _ in rules))
 
     def refuse(self, name, rule):
         """Raise UserError for the value of the field `name`."""
-        raise UserError(f"{type(self).__name__}: {name} must be {rule}, not "
-                        f"{getattr(self, name)!r}")
+        raise UserError(f"{type(self).__name__}: {name} must be {rule}, not {vars(self)[name]!r}")
 
 
 @dataclass(frozen=True)
 class ModelConfig(Settings):
     """Sizes of a world model. Raises UserError if the agents don't share the actions evenly."""
     dim_obs: int = field(0, "O: observation features", least=1)
-    dim_action: int = field(0, "A: action dimensions", most=1_000_000)
+    dim_action: int = field(0, "A: action dimensions", least=1, most=1_000_000)
     num_agents: int = field(1, "N: 1 is TD-MPC, A is Fac-TDMPC")
     latent_dim: int = field(50, "m: latent features of an agent (Table 2)", least=1)
     enc_dim: int = field(256, "hidden width of the encoder (Table 2)", least=1)
@@ -170,7 +178,7 @@ class PlannerConfig(Settings):
 @dataclass(frozen=True)
 class DistillConfig(Settings):
     """Algorithm 1. `--preset paper` takes each field's paper value."""
-    steps: int = field(14_000, "gradient steps [D1]", paper=100_000, least=1)
+    steps: int = field(14_000, "gradient steps (section 5.1: 10^5) [D1]", paper=100_000, least=1)
     batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=2)
     noise_samples: int = field(5, "K: perturbations of each action [D1]", paper=10, least=2)
     noise_std: float = field(0.5, "deviation of the perturbations (authors' code)", above=0)
@@ -219,13 +227,11 @@ def divisors(n):
 
 
 def from_dict(config_class, values, where):
-    """A config from a dict, e.g. a file's header; unknown keys and other types are refused."""
-    known = {f.name: type(f.default) for f in dataclasses.fields(config_class)}
+    """A config from a dict, e.g. a file's header; unknown keys are refused, too."""
+    known = [f.name for f in dataclasses.fields(config_class)]
     need(isinstance(values, dict), f"{where}: expected settings, found {values!r}")
-    for key, value in values.items():
+    for key in values:
         need(key in known, f"{where}: unknown setting {key!r}; expected some of {', '.join(known)}")
-        need(type(value) is known[key] or (known[key], type(value)) == (float, int),
-             f"{where}: {key}: expected {known[key].__name__}, found {value!r}")
     try:
         return config_class(**values)
     except UserError as error:
@@ -669,8 +675,8 @@ class Distiller:
     """Algorithm 1: one `step` after the other, reproducible from the seed, and from `state`.
 
     The expert is frozen: what it predicts for a pool of states and their perturbed actions is
-    computed once and learned from `reuse` times. Two threads share that, and each step's batch:
-    NumPy lets go of the interpreter inside its products. sizes: in place of `student_config`'s."""
+    computed once, learned from `reuse` times and, like each batch, shared by two threads: NumPy
+    frees the interpreter in products. sizes: for `student_config`'s. UserError: these don't fit."""
 
     loss, perturb = staticmethod(distill_loss), staticmethod(perturbed_batch)  # or a subclass's own
 
@@ -749,7 +755,7 @@ class Distiller:
         return tuple(total.tolist())
 
     def run(self, play_own=None):
-        """Algorithm 1 from here to its end; yields the losses of each step.
+        """Algorithm 1 from here to its end; yields each step's losses. UserError if they diverge.
 
         play_own(first, count): lets the student play episodes first, ..., first + count - 1 of its
         own and returns what `add` takes; not needed without own episodes [D8]."""
@@ -758,7 +764,9 @@ class Distiller:
             played, quarter = len(self.own), 4 * self.t // self.config.steps
             if quarter * self.config.own_episodes > played:
                 self.add(*play_own(played, quarter * self.config.own_episodes - played))
-            yield self.step()
+            losses = self.step()
+            check_finite({"loss is": losses}, self.t, self.config.lr)
+            yield losses
 
     @property
     def t(self):
@@ -767,8 +775,9 @@ class Distiller:
 
     def add(self, observation, action):
         """Let episodes (E, T, O), (E, T, A) join `own` (all, T, O + A) [D8]; T: EPISODE_STEPS."""
-        episodes = np.concatenate([observation, action], 2).astype(np.float16)
-        self.own = np.concatenate([self.own, episodes])
+        episodes = np.concatenate([observation, action], 2)
+        need((np.abs(episodes) <= 65504).all(), "own episodes: hold values that float16 can't")
+        self.own = np.concatenate([self.own, episodes.astype(np.float16)])
         self._number = None  # its pool is drawn again, with them
 
     def state(self):
@@ -796,11 +805,11 @@ def spearman(x, y):
 def horizon_returns(rewards, q1, q2, discount):
     """Equation 2 for H = 0, 1, ... at once, (L, B, K), from `predict`'s global rewards and Q."""
     gamma = (discount ** np.arange(len(rewards))).astype(rewards.dtype)[:, None, None]
-    return np.cumsum(gamma * rewards, 0) - gamma * rewards + gamma * (q1 + q2) / 2
+    return np.cumsum(gamma * rewards, 0) - gamma * rewards + gamma * (q1 + q2) / 2  # h < H, then Q
 
 
 def rank_correlation(distiller, states, discount=0.99):
-    """How alike student and expert order perturbed actions, as they do where the loss is smallest.
+    """How alike student and expert order perturbed actions; they agree where the loss is 0.
 
     Spearman's correlation over 32 action sequences, mean over `states` held-out states; 1 is the
     same order (section 4.4). Returns that of the global Q at each step h of the rollout, and that
@@ -888,9 +897,8 @@ def policy_noise(shape, rng):
 
 
 class AgentPlanner:
-    """Plans for the agents of one model, whether they are all, a part, or one.
-
-    rows, swap: for `Returns`, where an agent is another process's, too."""
+    """Plans for all, some or one of a model's agents. rows, swap: for `Returns`, where another
+    process shares one."""
 
     def __init__(self, model, config, rows=None, swap=None):
         self.model, self.config = model, config
@@ -955,7 +963,7 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
         self.own.reset(seeds[self._parts[0]])
 
     def act(self, obs):
-        """obs (O,) -> action (A,), float32 in [-1, 1]. UserError for another shape, or NaN."""
+        """obs (O,) -> action (A,), float32 in [-1, 1]. UserError: other shape, NaN, no finite G."""
         obs = np.asarray(obs, F32)
         shape = (self.model.config.dim_obs,)
         need(obs.shape == shape, f"observation: expected shape {shape}, found {obs.shape}")
@@ -1006,8 +1014,8 @@ class Returns:
     (dynamics with reward; both Q). The latent's part of that product is computed once a plan, as
     all samples start from one latent. LayerNorm's mean and gain are folded into the weights.
 
-    rows: where another process plans the first or last agent, too. Both draw the same actions; of
-    block k each rolls out the agents rows[k], a slice; `swap` adds up what they found."""
+    rows: where another process plans the first or last agent, too. Both draw the same actions;
+    each rolls out, for block k, only the agents in the slice rows[k]; `swap` adds up returns."""
 
     def __init__(self, model, rows=None, swap=None):
         self.sizes, p = model.config, model.params  # below, w is the hidden width
@@ -1103,7 +1111,7 @@ def split_agents(agents, workers, blocks=1):
     """Two lists, an entry for this process and for each worker beside it: its agents, a slice; and
     None or, for each block of samples, those that it rolls out. UserError for too many workers.
 
-    The latter where agents don't divide evenly but blocks do (512 samples are 2 or 4): of 3 agents
+    The latter where a cut of agents x blocks (512 samples are 2 or 4) falls inside an agent: of 3
     in 2 blocks both processes plan agent 1; its first block is rolled out here, the other there."""
     need(0 <= workers < agents, f"{workers} workers are no use to {agents} agents, one of which is "
          f"left to this process; pass 0 to {agents - 1}")
@@ -1270,8 +1278,7 @@ class Environment:
 
     def step(self, action):
         """Apply action (dim A,); returns next observation (dim O,) and reward in [0, 2]."""
-        control = self._low + self._scale * (np.asarray(action, np.float64) + 1)
-        reward = 0.0
+        control, reward = self._low + self._scale * (np.asarray(action, np.float64) + 1), 0.0
         for _ in range(ACTION_REPEAT):
             timestep = self.env.step(control)
             reward += timestep.reward
@@ -1366,6 +1373,7 @@ def save_model(path, model, header):
     for key, value in model.params.items():
         need(value.ndim == 3, f"{key}: expected (N, rows, columns), found {value.shape}")
         value = value[..., 0] if key.endswith("bias") or key.split(".")[1] == "1" else value
+        need(np.isfinite(value).all(), f"{path}: {key}: would hold values that are not finite")
         arrays[key] = value[0] if len(value) == 1 else value
     write_npz(path, {**header, "model": asdict(model.config)}, arrays)
 
@@ -1374,8 +1382,8 @@ def load_model(path, kinds=("expert", "student")):
     """(model, header) of one of these kinds. UserError names file, key, expected and found."""
     header, arrays = read_npz(path, kinds)
     config = from_dict(ModelConfig, header.get("model"), f"{path}: header: model")
-    params = {}
-    for name, i, kind, shape, _ in layers(config, policy="_pi.0.weight" in arrays):
+    params, policy = {}, config.num_agents == 1 and "_pi.0.weight" in arrays
+    for name, i, kind, shape, _ in layers(config, policy):
         for part, expected in (("weight", shape), ("bias", (*shape[:2], 1))):
             key = f"{name}.{i}.{part}"
             on_disk = expected if kind == "linear" and part == "weight" else expected[:2]
@@ -1388,7 +1396,7 @@ def load_model(path, kinds=("expert", "student")):
             need(np.isfinite(value).all(), f"{path}: {key}: holds values that are not finite")
             params[key] = np.ascontiguousarray(value.reshape(expected))
     need(not arrays, f"{path}: {next(iter(arrays), None)}: unknown entry; expected TD-MPC's "
-         f"state-dict names only")
+         f"state-dict names only, _pi's of one agent")
     return WorldModel(config, params), header
 
 
@@ -1430,23 +1438,24 @@ class Replay:
         need(self.ends[-1:].tolist() == [len(self.observation) - 1],
              f"{path}: continues: expected False in the last row")
 
-    def starts(self, steps, held_out):
-        """Rows from which `steps` actions stay in their episode: (training, held-out) rows.
+    def starts(self, length, held_out):
+        """Rows from which `length` actions stay in their episode: (training, held-out) rows.
 
-        Every (1 / held_out)-th episode is held out: all of training counts. UserError: too few."""
+        Every (1 / held_out)-th episode is held out, early and late ones. UserError: too few."""
         every = max(2, round(1 / held_out))
         training, held = [], []
         for i, (begin, end) in enumerate(zip(np.r_[0, self.ends + 1], self.ends)):
-            (held if i % every == every - 1 else training).append(np.arange(begin, end - steps + 1))
+            into = held if i % every == every - 1 else training
+            into.append(np.arange(begin, end - length + 1))
         need(sum(map(len, training)) and sum(map(len, held)),
              f"{self.path}: {len(self.ends)} episodes are too few to hold out a share of "
-             f"{held_out} and sample {steps} steps; collect more, or hold out a larger share")
+             f"{held_out} and sample {length} actions in a row; collect more, or hold out more")
         return np.concatenate(training), np.concatenate(held)
 
-    def sequences(self, starts, steps):
-        """First observations (O, B) and actions (L, A, B), float32, of the rows in `starts`."""
+    def sequences(self, starts, length):
+        """First observations (O, B) and actions (L, A, B), float32, from the rows `starts` on."""
         obs = self.observation[starts].T.astype(F32)
-        actions = self.action[starts + np.arange(steps)[:, None]]
+        actions = self.action[starts + np.arange(length)[:, None]]
         return obs, actions.swapaxes(1, 2).astype(F32)
 
 
@@ -1556,8 +1565,7 @@ def progress(label, total, unit, initial=0):
 def interleaved_seconds(calls, rounds, label):
     """Seconds of functions that are called one after the other, again and again: (rounds, calls).
 
-    So noise hits all alike. BLAS has one thread meanwhile: idle ones would keep a core from the
-    worker processes. A round before the first isn't counted."""
+    So noise hits all alike. One BLAS thread leaves cores to workers. A first round is dropped."""
     seconds = np.zeros((rounds + 1, len(calls)))
     with one_thread(), progress(label, rounds + 1, "round") as bar:
         for row in seconds:
@@ -1576,8 +1584,8 @@ CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correla
 def train_student(distiller, out, settings, playing, workers):
     """Algorithm 1 to its end, with a learning curve and checkpoints in the folder `out`.
 
-    A run that was cut off goes on from its checkpoint and ends as if it had not been. Returns
-    (curve rows, seconds). playing, workers: how the student plays its own episodes [D8]."""
+    A run that was cut off goes on from its checkpoint to the same end (UserError: it is damaged, or
+    another run's). Returns (curve rows, seconds). playing, workers: of the own episodes [D8]."""
     def play_own(first, count):
         seeds = training_seeds(distiller.seed, "own episode", first, count)
         return play(distiller.student, settings["task"], playing, seeds, workers,
@@ -1597,7 +1605,6 @@ def train_student(distiller, out, settings, playing, workers):
     with progress("distilling", config.steps, "step", distiller.t) as bar:
         for found in distiller.run(play_own):
             losses.append(found)
-            check_finite({"loss is": found}, distiller.t, config.lr)
             bar.update()
             if distiller.t % every and distiller.t < config.steps:
                 continue
@@ -1616,13 +1623,6 @@ def train_student(distiller, out, settings, playing, workers):
                                        "seconds": seconds}, distiller.state())
                 saved = time.time()
     return curve, before + time.time() - began
-
-
-def check_finite(values, update, lr):
-    """UserError if learning diverged, before its weights are saved."""
-    for name, value in values.items():
-        need(np.isfinite(value).all(), f"after update {update} the {name} no longer finite: "
-             f"learning diverged; lower the learning rate ({lr})")
 
 
 def same_settings(found, expected, where, group=""):

@@ -9,8 +9,8 @@ what differs is the model of the world that it imagines with:
 
 `python manipulator_demo.py` compares them and checks appendix A.1 by machine, in seconds.
 
-Axes: N agents, H horizon, d action dimensions and s state features of an agent, S samples (always
-last); `...` is N, goals or nothing. Angles in radians, lengths in the links' unit, equation
+Axes: N agents, H actions in a row, d action dimensions and s state features of an agent, S samples
+(always last); `...` is N, goals or nothing. Angles in radians, lengths in the links' unit, equation
 numbers as in the paper. One step is 0.1 s (Table 1: freq 10).
 """
 
@@ -79,9 +79,10 @@ START_ANGLES, GOAL_ANGLES = inverse_kinematics(np.stack([START, GOAL], axis=1)).
 def closed_form_kinematics(xy):
     """The same map without iterations: tip (..., 2, S) -> angles (..., 3, S).
 
-    Three joints reach a point in infinitely many ways; this is the one whose theta_3 is nearest to
-    IK_START's. With that wrist links 2 and 3 are one straight link of length r, and a two-link arm
-    has a textbook solution. r is clipped so that every reachable point is solved.
+    Three joints reach a point in infinitely many ways; this is, of the two with theta_3 nearest to
+    IK_START's, the one of positive bend (theta_2 itself may be negative). With that wrist links 2
+    and 3 are one straight link of length r, and a two-link arm has a textbook solution. r is
+    clipped so that every reachable point is solved.
     """
     one, two, three = LINKS
     x, y = xy[..., 0, :], xy[..., 1, :]
@@ -283,7 +284,7 @@ def _error(form, exact):
 def check_signs(rng, poses=1000):
     """Equations 19 to 23 against 14 to 17, for random goals as the paper assumes them, beside the
     last link: (x, y) - goal = sqrt(c_e) (-sin, cos)(c1 + c2 + c3). {equation: largest relative
-    error, and the share of random poses where its '> 0' holds}."""
+    error, and the share of random poses where the derivative itself is > 0}."""
     theta = rng.uniform(LOW[:, None], (LOW + SPAN)[:, None], (3, poses))
     root, heading = rng.uniform(0.1, 1, poses), theta.sum(axis=0)  # sqrt(c_e), c1 + c2 + c3
     x, y = forward_kinematics(theta)
@@ -452,7 +453,7 @@ speed-up of the factored model: x{result['speedup']:.1f} (the paper: x30)""")
 
 
 def print_appendix(result):
-    """Section 5 in words."""
+    """Appendix A.1, as checked, in words."""
     print("\nappendix A.1, at random poses: Eq. 14 to 18 against central differences, Eq. 19 to 23 "
           "against 14\nto 17, where the paper assumes the goal to be")
     rows = [(key, f"{error:.0e}", "") for key, error in result["derivatives"].items()]

@@ -124,7 +124,17 @@ def test_weights_without_their_axes_are_not_saved(tmp_path):
     model.params["_Q1.0.bias"] = model.params["_Q1.0.bias"][..., 0]
     with pytest.raises(fac.UserError, match=r"_Q1.0.bias: expected \(N, rows, columns\), found"):
         fac.save_model(tmp_path / "m.npz", model, {"kind": "expert"})
+    model = make_model()
+    model.params["_Q1.0.bias"][0, 1] = np.nan
+    refusal(lambda: fac.save_model(tmp_path / "m.npz", model, {}), "npz: _Q1.0.bias", "not finite")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_policy_of_several_agents_is_unknown(tmp_path):
+    model = make_model(3)
+    model.params["_pi.0.weight"] = model.params["_dynamics.0.weight"]
+    fac.save_model(path := tmp_path / "m.npz", model, {"kind": "student"})
+    refusal(lambda: fac.load_model(path), path, "_pi.0.weight", "unknown entry", "of one agent")
 
 
 # read_npz -----------------------------------------------------------------------------

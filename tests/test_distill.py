@@ -206,6 +206,16 @@ def test_any_divisor_of_the_actions(replay, n):
     assert np.isfinite(losses).all()
 
 
+def test_what_diverges_stops(replay):
+    with fresh(replay, CONFIG) as distiller:
+        episode = np.full((1, fac.EPISODE_STEPS, 8), 1e6), np.zeros((1, fac.EPISODE_STEPS, 3))
+        with pytest.raises(fac.UserError, match="own episodes: hold values"):
+            distiller.add(*episode)
+        distiller.optimizer.vector[:] = np.nan
+        with pytest.raises(fac.UserError, match="after update 1 the loss is no longer finite"):
+            list(distiller.run())
+
+
 def test_other_numbers_of_agents_are_refused(replay):
     for n in (2, 0, 4):
         with pytest.raises(fac.UserError, match=r"one of \[1, 3\]"):
@@ -233,13 +243,13 @@ def test_held_out_episodes_are_for_the_rank_correlation_alone(tmp_path, monkeypa
     with fresh(replay, config) as distiller:
         for t in range(40):
             assert np.abs(distiller.batch(t)[0]).max() < 10
-    seen, perturbed_batch = [], fac.perturbed_batch
+    seen = []
 
     def watched(expert, student, obs, *rest):
         seen.append(obs)
-        return perturbed_batch(expert, student, obs, *rest)
+        return fac.perturbed_batch(expert, student, obs, *rest)
 
-    monkeypatch.setattr(fac, "perturbed_batch", watched)
+    monkeypatch.setattr(distiller, "perturb", watched)
     rank(distiller)
     assert len(seen) == 1 and (seen[0] == 50).all()
 

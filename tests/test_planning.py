@@ -186,12 +186,15 @@ def test_an_observation_of_the_wrong_size_is_refused():
 def test_planner_config_refuses_nonsense():
     for wrong, text in (({"elites": 9, "samples": 8}, r"elites must be at most samples \(8\)"),
                         ({"min_std": 3.0}, r"min_std must be at most max_std \(2.0\)"),
-                        ({"discount": 1.1}, "at least 0 and at most 1")):
+                        ({"discount": 1.1}, "at least 0 and at most 1"),
+                        ({"samples": 64.0}, "samples must be of type int, not 64.0"),
+                        ({"discount": True}, "of type float"), ({"output": None}, "of type str"),
+                        ({"inverse_temperature": 1e40}, "finite, as a float32")):
         with pytest.raises(fac.UserError, match=text):
             fac.PlannerConfig(**wrong)
     assert fac.PlannerConfig().num_elites == 16
     assert fac.dataclasses.replace(fac.PlannerConfig(), samples=512).num_elites == 64
-    assert fac.PlannerConfig(samples=3).num_elites == 1
+    assert fac.PlannerConfig(samples=np.int64(3), discount=1).num_elites == 1
 
 
 # ------------------------------------------------------------------------------- workers
