@@ -110,6 +110,7 @@ class Settings:
                 rules.append(("at most 10^9", False))
             if not all(holds for _, holds in rules):
                 self.refuse(f.name, " and ".join(words for words, _ in rules))
+            object.__setattr__(self, f.name, cls(value))  # 1 is 1.0, and NumPy's are Python's
 
     def refuse(self, name, rule):
         """Raise UserError for the value of the field `name`."""
@@ -676,7 +677,7 @@ class Distiller:
 
     The expert is frozen: what it predicts for a pool of states and their perturbed actions is
     computed once, learned from `reuse` times and, like each batch, shared by two threads: NumPy
-    frees the interpreter in products. sizes: for `student_config`'s. UserError: these don't fit."""
+    frees the interpreter meanwhile. sizes: replace `student_config`'s. UserError: misfits."""
 
     loss, perturb = staticmethod(distill_loss), staticmethod(perturbed_batch)  # or a subclass's own
 
@@ -703,7 +704,7 @@ class Distiller:
                         for _ in range(2)]  # each thread's gradient: a vector, its parts by name
 
     def draw(self, number, part, size):
-        """Lines 4 and 6 (expert) for `size` states, a pool's part, as `perturbed_batch`."""
+        """Lines 4 and 6 (expert) for `size` states, a pool's part: as `perturb` returns."""
         rng, L = stream(self.seed, f"pool {number}", part), self.config.horizon + 1
         K, dim_obs = self.config.noise_samples, self.replay.dim_obs
         obs, actions = self.replay.sequences(rng.choice(self.train_starts, size), L)
@@ -719,7 +720,7 @@ class Distiller:
 
     def batch(self, t):
         """Step t's part of its pool, which is gone through `reuse` times, in another order each:
-        features, perturbed actions and targets, as `perturbed_batch`."""
+        features, perturbed actions and targets."""
         size, reuse = self.config.batch_size, self.config.reuse
         number, step = divmod(t, reuse * self.pool_size // size)  # which pool, which of its steps
         if number != self._number:
@@ -776,7 +777,7 @@ class Distiller:
     def add(self, observation, action):
         """Let episodes (E, T, O), (E, T, A) join `own` (all, T, O + A) [D8]; T: EPISODE_STEPS."""
         episodes = np.concatenate([observation, action], 2)
-        need((np.abs(episodes) <= 65504).all(), "own episodes: hold values that float16 can't")
+        need((np.abs(episodes) <= 65504).all(), "own episodes: not finite, or above 65504")
         self.own = np.concatenate([self.own, episodes.astype(np.float16)])
         self._number = None  # its pool is drawn again, with them
 
@@ -805,7 +806,7 @@ def spearman(x, y):
 def horizon_returns(rewards, q1, q2, discount):
     """Equation 2 for H = 0, 1, ... at once, (L, B, K), from `predict`'s global rewards and Q."""
     gamma = (discount ** np.arange(len(rewards))).astype(rewards.dtype)[:, None, None]
-    return np.cumsum(gamma * rewards, 0) - gamma * rewards + gamma * (q1 + q2) / 2  # h < H, then Q
+    return np.cumsum(gamma * rewards, 0) - gamma * rewards + gamma * (q1 + q2) / 2  # h < H; Q at H
 
 
 def rank_correlation(distiller, states, discount=0.99):
@@ -1112,7 +1113,7 @@ def split_agents(agents, workers, blocks=1):
     None or, for each block of samples, those that it rolls out. UserError for too many workers.
 
     The latter where a cut of agents x blocks (512 samples are 2 or 4) falls inside an agent: of 3
-    in 2 blocks both processes plan agent 1; its first block is rolled out here, the other there."""
+    agents both processes plan agent 1; its first block is rolled out here, its second there."""
     need(0 <= workers < agents, f"{workers} workers are no use to {agents} agents, one of which is "
          f"left to this process; pass 0 to {agents - 1}")
     cuts = np.linspace(0, agents * blocks, workers + 2).round().astype(int)
@@ -1938,8 +1939,7 @@ def make_parser():
 
     sub = add_command(commands, "distill", command_distill, "Distil a task's expert into a "
                       "factored student (Algorithm 1), then evaluate and time both with MPPI.",
-                      epilog="Given again, a run that was cut off goes on; one that is over is "
-                      "evaluated.")
+                      epilog="Given again, a cut-off run goes on; a finished one is evaluated.")
     add = sub.add_argument
     add("--task", default="reacher-hard", help="one of: " + ", ".join(TASKS))
     add("--seed", type=natural, default=0, help="of distillation [0]")

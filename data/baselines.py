@@ -150,12 +150,13 @@ class TapDistiller(fac.Distiller):
 
     def perturb(self, expert, student, obs, actions, config, rng):
         """As `perturbed_batch`, of latent actions u_h (L, 2, B, K): what actions encode to, each in
-        the expert's own latent, plus noise; the predictions are for what u_h decodes to."""
+        the expert's own latent, plus noise (0.5 is 1.5 deviations of the prior), clipped like the
+        planner's; the predictions are for what u_h decodes to."""
         L, A, B, _ = actions.shape
         K, z = config.noise_samples, expert.encode(obs)
         s, latent, decoded = np.repeat(z, K, 2), [], []
         for a in np.broadcast_to(actions, (L, A, B, K)).reshape(L, A, -1):
-            noise = config.noise_std * rng.standard_normal((LATENT_ACTION, B * K), fac.F32)
+            noise = fac.F32(config.noise_std) * rng.standard_normal((LATENT_ACTION, B * K), fac.F32)
             u = self.vae.encode(np.concatenate([s[0], a])) + noise
             latent.append(np.clip(u, -1, 1))
             decoded.append(self.vae.decode(s[0], latent[-1]))

@@ -116,7 +116,7 @@ def attempt(function, run, home):
         try:
             settings = json.loads(run["settings"])
             fac.need(settings.get("data") == made_from(run["task"], settings),
-                     f"data/{run['task']} or a default has changed since")
+                     f"data/{run['task']} or a default has changed; give the command again")
             settings.pop("data", None)
             found = list(function(run["task"], int(run["seed"]), run["case"], settings))
             found[-1].setdefault("minutes", (time.time() - began) / 60)
@@ -212,7 +212,7 @@ def distil(task, seed, case, settings):
             if distiller.t % every and distiller.t < config.steps:
                 continue
             row = measure(student, task, planning, own["episodes"], environment)
-            if not environment:
+            if not environment:  # others' ranks are of the robot's actions
                 q, g = fac.rank_correlation(distiller, 256, planning.discount)
                 row.update(rank_q=float(q[0]), rank_return=float(g[-1]))
             yield {"step": distiller.t, **row}
@@ -348,15 +348,15 @@ def identity(model, header):
     """What a run's settings say of its model: its weights; how it was made, as seeds share it."""
     planning = planning_for(header, {})
     return {"weights": fac.record_key(model, planning, 0), "made": crc(
-        header.get("distill"), model.config.num_agents, planning)}
+        header.get("distill"), header.get("data"), model.config.num_agents, planning)}
 
 
 def plan_with(task, seed, case, settings, students):
     """The returns of a model: with its file's planning but for `samples` and `iterations`, on a
     robot that `joint` and `kind` disturb. students: a folder, see `load`."""
     model, header = load(task, seed, case, students)
-    fac.need(identity(model, header).items() <= settings.items(), f"{students}: {task}'s {case} "
-             "has changed meanwhile")
+    fac.need(identity(model, header).items() <= settings.items(), f"{case} of {task}, seed {seed}, "
+             f"in data/ or {students}/, has changed; give the command again")
     planning = planning_for(header, settings)
     environment = (DisturbedEnvironment(task, settings["joint"], settings["kind"])
                    if settings.get("kind") else None)
@@ -439,9 +439,10 @@ def online(task, seed, decisions, episodes):
     import train_expert
     args = train_expert.make_parser().parse_args([
         "--task", task, "--seed", str(seed), "--student", "fac", "--steps", str(decisions),
-        "--workers", "1", "--episodes", "0", "--evaluate-episodes", str(episodes),
-        "--out", f"runs/online-{task}-{seed}-{decisions}-{episodes}"])
-    return args, crc(train_expert.read_settings(args), args.envs, args.refresh, args.evaluate_every)
+        "--workers", "1", "--episodes", "0", "--evaluate-episodes", str(episodes)])
+    data = crc(train_expert.read_settings(args), args.envs, args.refresh, args.evaluate_every)
+    args.out = f"runs/online-{task}-{seed}-{decisions}-{episodes}-{data}"
+    return args, data
 
 
 def follow(task, seed, case, settings):
@@ -487,12 +488,14 @@ def settled(path, but=()):
     for task, seed, case, settings in rows:
         about = {k: v for k, v in json.loads(settings).items() if k not in but}
         weights, budget = about.pop("weights", None), {k: about.get(k) for k in BUDGET}
-        for key, found in (((seed, case), weights), ((case,), about), ((), budget)):
-            other = seen.setdefault((task, *key), found)
-            fac.need(other == found, f"{path}: {case} of {task} was made with {other} and, seed "
-                     f"{seed}, with {found}; delete the rows that are of no use")
-    for task, budget in ((key[0], found) for key, found in seen.items() if len(key) == 1):
-        if budget["data"] != made_from(task, budget):
+        for key, found in (((seed, case), {"weights": weights}), ((case,), about), ((), budget)):
+            other, of, at = seen.setdefault((task, *key), (found, case, seed))
+            odd = [k for k in {**other, **found} if other.get(k) != found.get(k)]
+            fac.need(not odd, f"{path}: {of} of {task}, seed {at}, was made with "
+                     f"{ {k: other.get(k) for k in odd} }, {case}, seed {seed}, with "
+                     f"{ {k: found.get(k) for k in odd} }; delete the rows that are of no use")
+    for (task, *rest), (found, *_) in seen.items():
+        if not rest and found["data"] != made_from(task, found):
             print(f"{path}: {task} was made with other data or defaults than now", file=sys.stderr)
     return rows
 

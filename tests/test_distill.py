@@ -209,7 +209,7 @@ def test_any_divisor_of_the_actions(replay, n):
 def test_what_diverges_stops(replay):
     with fresh(replay, CONFIG) as distiller:
         episode = np.full((1, fac.EPISODE_STEPS, 8), 1e6), np.zeros((1, fac.EPISODE_STEPS, 3))
-        with pytest.raises(fac.UserError, match="own episodes: hold values"):
+        with pytest.raises(fac.UserError, match="own episodes: not finite"):
             distiller.add(*episode)
         distiller.optimizer.vector[:] = np.nan
         with pytest.raises(fac.UserError, match="after update 1 the loss is no longer finite"):

@@ -433,11 +433,25 @@ def test_tap_learns_from_the_robot_s_actions_of_its_own_episodes():
         s = expert.encode(obs[1, 7][:, None])[0]
         expected = distiller.vae.decode(s, u[1, 7][:, None])[:, 0]
         assert np.allclose(distiller.own[1, 7, 8:], expected, atol=1e-3)
-        z, u, targets = distiller.draw(0, 0, 4)  # these are for what the robot would do
-        s, u0 = np.repeat(z, config.noise_samples, 2), u[0].reshape(2, -1)
-        rewards = expert.reward(s, distiller.vae.decode(s[0], u0)[None])
-        assert u.shape == (4, 2, 4, config.noise_samples) and np.abs(u).max() <= 1
-        np.testing.assert_allclose(targets[0][0].ravel(), rewards[0], rtol=1e-4, atol=1e-5)
+        obs, actions = replay.sequences(distiller.train_starts[:4], 4)
+        spread = []
+        for deviation in (1e-7, 0.5):  # targets are for what the robot would do
+            z, u, targets = distiller.perturb(
+                expert, distiller.student, obs, actions[..., None],
+                fac.dataclasses.replace(config, noise_std=deviation), rng)
+            s, copies = np.repeat(z, config.noise_samples, 2), np.repeat(actions, 5, 2)
+            for h, a in enumerate(copies):
+                u_h = u[h].reshape(2, -1)
+                if deviation < 0.1:
+                    encoded = distiller.vae.encode(np.concatenate([s[0], a]))
+                    np.testing.assert_allclose(u_h, encoded, atol=1e-5)
+                decoded = distiller.vae.decode(s[0], u_h)[None]
+                np.testing.assert_allclose(targets[0][h].ravel(), expert.reward(s, decoded)[0],
+                                           rtol=1e-3, atol=1e-4)
+                s = expert.next(s, decoded)
+            spread.append(u.std(-1).mean())
+            assert u.shape == (4, 2, 4, config.noise_samples) and np.abs(u).max() <= 1
+        assert spread[0] < 1e-5 < 0.2 < spread[1] < 0.5
         assert np.isfinite(distiller.step()).all()
 
 
@@ -474,7 +488,8 @@ def test_figures_7_and_8_plan_with_both_models(tmp_path, monkeypatch, capsys):
     assert len(seen) == 2 * (1 + 3 * 3)
     row = experiments.attempt(functools.partial(experiments.plan_with, students="runs"), {
         **seen[-1], "settings": seen[-1]["settings"].replace("weights ", "weights 1")}, 0)[-1]
-    assert row["error"] == "UserError: runs: reacher-hard's student has changed meanwhile"
+    assert row["error"] == ("UserError: student of reacher-hard, seed 0, in data/ or runs/, has "
+                            "changed; give the command again")
     for data, status in ((experiments.data_checksums("reacher-hard"), 0), ([1, 2, None], 2)):
         fac.save_model("runs/reacher-hard-0/student.npz", random_model(), {
             "kind": "student", "data": data})
@@ -491,13 +506,13 @@ def test_a_run_made_with_other_defaults_is_another_run(monkeypatch):
         monkeypatch.setattr(fac, "PlannerConfig", config_class)
         assert experiments.main(["sweep", *flags]) == 0
     assert seen[0] == seen[1] != seen[2]
-    expected = "data/reacher-hard or a default has changed since"
+    expected = "data/reacher-hard or a default has changed; give the command again"
     assert expected in experiments.attempt(experiments.distil, seen[0], os.getpid())[-1]["error"]
     settings = {"decisions": 4000, "episodes": 1}
     before = experiments.made_from("walker-walk", {"data": 0, **settings})
     monkeypatch.setitem(train_expert.FOLLOWING_DEFAULTS, "own_share", 0.5)
     run = experiments.make_run("walker-walk", 0, "online", data=before, **settings)
-    assert "has changed since" in experiments.attempt(experiments.follow, run, 0)[-1]["error"]
+    assert "a default has changed" in experiments.attempt(experiments.follow, run, 0)[-1]["error"]
 
 
 def test_departures_are_those_that_the_settings_name(monkeypatch):
@@ -519,17 +534,31 @@ def test_the_cases_of_figure_5_learn_what_they_say():
     assert set(kinds.values()) == {fac.Distiller} and len(kinds) == 6
 
 
-@pytest.mark.parametrize("case, seed", [("TAP", 0), ("TAP", 1), ("10% TD-MPC", 0)])
-def test_runs_of_other_settings_don_t_make_one_figure(tmp_path, capsys, case, seed):
-    path = tmp_path / "figure4.csv"
-    write_rows(path, [("walker-run", at, what, {"episodes": n, "weights": at, "data": [1]}, [
-        {"step": 1, "return_mean": 1.0, "minutes": 1.0}]) for what, n, at in (
-            ("TAP", 5, 0), (case, 10, seed))])
-    expected = rf"{case} of walker-run was made with .*, seed {seed}, with .*'episodes': 10"
-    with pytest.raises(fac.UserError, match=expected):
-        experiments.settled(path)
-    assert len(experiments.settled(path, ("episodes",))) == 2
+@pytest.mark.parametrize("case, seed, setting, found", [
+    ("TAP", 1, "episodes", (5, 10)),         # a case's seeds
+    ("TAP", 1, "lr", (0.1, 0.2)),
+    ("10% TD-MPC", 0, "episodes", (5, 10)),  # a task's cases have one budget
+    ("TAP", 0, "weights", ("a", "b"))])      # a seed's student
+def test_runs_of_other_settings_don_t_make_one_figure(tmp_path, capsys, case, seed, setting, found):
+    path, rows = tmp_path / "figure4.csv", [{"step": 1, "return_mean": 1.0, "minutes": 1.0}]
+    for i, (what, at) in enumerate((("TAP", 0), (case, seed))):
+        settings = {"weights": at, "data": [1], "joint": i, setting: found[i]}
+        write_rows(path, [("walker-run", at, what, settings, rows)])
+    first, second = ({setting: value} for value in found)
+    with pytest.raises(fac.UserError) as caught:
+        experiments.settled(path, ("joint",))
+    assert (f"TAP of walker-run, seed 0, was made with {first}, {case}, seed {seed}, with {second};"
+            in str(caught.value))
+    assert len(experiments.settled(path, ("joint", setting))) == 2
     assert "walker-run was made with other data or defaults than now" in capsys.readouterr().err
+
+
+def test_what_a_student_was_made_with_tells_it_apart():
+    model, seen = random_model(), set()
+    for header in ({}, {"distill": {"lr": 1}}, {"distill": {"lr": 2}}, {"data": [1]},
+                   {"training": {"discount": 0.5}}):
+        seen.add(experiments.identity(model, header)["made"])
+    assert len(seen) == 5
 
 
 @pytest.mark.parametrize("left", ["", "task,se"])
