@@ -676,8 +676,8 @@ class Distiller:
     """Algorithm 1: one `step` after the other, reproducible from the seed, and from `state`.
 
     The expert is frozen: what it predicts for a pool of states and their perturbed actions is
-    computed once, learned from `reuse` times and, like each batch, shared by two threads: NumPy
-    frees the interpreter meanwhile. sizes: replace `student_config`'s. UserError: misfits."""
+    computed once and learned from `reuse` times, by two threads, as NumPy frees the interpreter.
+    sizes: replace `student_config`'s. UserError if expert, replay and config don't fit."""
 
     loss, perturb = staticmethod(distill_loss), staticmethod(perturbed_batch)  # or a subclass's own
 
