@@ -154,16 +154,17 @@ class TapDistiller(fac.Distiller):
         planner's; the predictions are for what u_h decodes to."""
         L, A, B, _ = actions.shape
         K, z = config.noise_samples, expert.encode(obs)
-        s, latent, decoded = np.repeat(z, K, 2), [], []
+        latent, inputs = [], []  # the latter as `unroll` gives them: (1, m + A, B * K) each
         for a in np.broadcast_to(actions, (L, A, B, K)).reshape(L, A, -1):
+            s = (fac.forward(fac.MLP, expert.params, "_dynamics", inputs[-1]) if inputs
+                 else np.repeat(z, K, 2))
             noise = fac.F32(config.noise_std) * rng.standard_normal((LATENT_ACTION, B * K), fac.F32)
             u = self.vae.encode(np.concatenate([s[0], a])) + noise
             latent.append(np.clip(u, -1, 1))
-            decoded.append(self.vae.decode(s[0], latent[-1]))
-            s = expert.next(s, decoded[-1][None])
-        latent, decoded = (np.stack(x).reshape(L, -1, B, K) for x in (latent, decoded))
+            inputs.append(np.concatenate([s, self.vae.decode(s[0], latent[-1])[None]], 1))
+        latent = np.stack(latent).reshape(L, -1, B, K)
         features = z if student.config.expert_latent_dim else obs[None]
-        return features, latent, fac.predict(expert, z, decoded)
+        return features, latent, fac.run_heads(expert, np.concatenate(inputs, 2), latent)
 
     def add(self, observation, action):
         """As Distiller's, of latent actions (E, T, 2): `perturb` takes the robot's."""
