@@ -295,31 +295,33 @@ def test_an_interrupted_decision_ends_the_workers(monkeypatch):
             planner.act(np.zeros(8))
 
 
-SCRIPT = """
-import signal, sys, time
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell has it ignored
-sys.path.insert(0, {root!r})
-import numpy as np
+# how a script of its own process begins
+IMPORTS = f"""
+import sys
+sys.path[:0] = [{str(fac.DATA.parent)!r}, {os.path.dirname(os.path.abspath(__file__))!r}]
 import fac_tdmpc_ref as fac
 from test_planning import random_model
-
+"""
+SCRIPT = """
+import signal, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell has it ignored
+""" + IMPORTS + """
 if __name__ == "__main__":
     planner = fac.Planner(random_model(), fac.PlannerConfig(samples=16), workers=2)
-    planner.act(np.zeros(8))
+    planner.act([0.0] * 8)
     print(*[process.pid for process, _ in planner._workers._members], flush=True)
     while True:
-        planner.act(np.zeros(8))
+        planner.act([0.0] * 8)
 """
 
 
 @pytest.mark.parametrize("blow", [signal.SIGINT, signal.SIGKILL])
 def test_workers_end_with_their_parent(blow, tmp_path):
     script = tmp_path / "plan.py"
-    script.write_text(SCRIPT.format(root=os.path.dirname(os.path.abspath(__file__))))
+    script.write_text(SCRIPT)
     before = shared_memory()
-    environment = {**os.environ, "PYTHONPATH": str(fac.DATA.parent)}
     process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True,
-                               stderr=subprocess.PIPE, env=environment, start_new_session=True)
+                               stderr=subprocess.PIPE, start_new_session=True)
     pids = [int(word) for word in process.stdout.readline().split()]
     assert len(pids) == 2
     if blow == signal.SIGINT:
@@ -341,22 +343,15 @@ def test_workers_end_with_their_parent(blow, tmp_path):
 @pytest.mark.parametrize("hidden", [16, 400])  # in one piece through a pipe, and not
 def test_an_unguarded_script_gets_an_error_not_a_hang(tmp_path, hidden):
     script = tmp_path / "plan.py"
-    script.write_text(f"import sys\nsys.path[:0] = [{str(fac.DATA.parent)!r}, "
-                      f"{os.path.dirname(os.path.abspath(__file__))!r}]\n"
-                      "import fac_tdmpc_ref as fac\nfrom test_planning import random_model\n"
-                      f"fac.Planner(random_model(hidden={hidden}), workers=1)\nprint('made')\n")
+    script.write_text(f"{IMPORTS}fac.Planner(random_model(hidden={hidden}), workers=1)\n"
+                      "print('made')\n")
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60)
     assert done.returncode != 0 and "__main__" in done.stderr
     assert "made" not in done.stdout  # a planner that is made has workers that are ready
 
 
-FAULTS = f"""
-import sys
-sys.path[:0] = [{str(fac.DATA.parent)!r}, {os.path.dirname(os.path.abspath(__file__))!r}]
+FAULTS = IMPORTS + """
 from resource import RUSAGE_SELF, getrusage
-import fac_tdmpc_ref as fac
-from test_planning import random_model
-
 planner, faults = fac.Planner(random_model(12, 12, 50, 50)), []
 for _ in range(5):
     planner.act([0.0] * 8)
