@@ -487,7 +487,8 @@ def test_figures_7_and_8_plan_with_both_models(tmp_path, monkeypatch, capsys):
     assert experiments.main(["figure8", *flags]) == 0
     assert len(seen) == 2 * (1 + 3 * 3)
     row = experiments.attempt(functools.partial(experiments.plan_with, students="runs"), {
-        **seen[-1], "settings": seen[-1]["settings"].replace("weights ", "weights 1")}, 0)[-1]
+        **seen[-1], "settings": seen[-1]["settings"].replace("weights ", "weights 1")},
+        os.getpid())[-1]
     assert row["error"] == ("UserError: student of reacher-hard, seed 0, in data/ or runs/, has "
                             "changed; give the command again")
     for data, status in ((experiments.data_checksums("reacher-hard"), 0), ([1, 2, None], 2)):
@@ -512,7 +513,8 @@ def test_a_run_made_with_other_defaults_is_another_run(monkeypatch):
     before = experiments.made_from("walker-walk", {"data": 0, **settings})
     monkeypatch.setitem(train_expert.FOLLOWING_DEFAULTS, "own_share", 0.5)
     run = experiments.make_run("walker-walk", 0, "online", data=before, **settings)
-    assert "a default has changed" in experiments.attempt(experiments.follow, run, 0)[-1]["error"]
+    row = experiments.attempt(experiments.follow, run, os.getpid())[-1]
+    assert "a default has changed" in row["error"]
 
 
 def test_departures_are_those_that_the_settings_name(monkeypatch):
