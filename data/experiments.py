@@ -15,6 +15,7 @@ import csv
 import ctypes
 import dataclasses
 import functools
+import importlib.util
 import io
 import itertools
 import json
@@ -22,6 +23,7 @@ import os
 import re
 import sys
 import time
+from collections import Counter
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
@@ -29,9 +31,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import fac_tdmpc_ref as fac  # noqa: E402
+import look  # noqa: E402
+import speed  # noqa: E402
 from baselines import DecodingEnvironment, distiller_of  # noqa: E402
-from look import command_agreement, command_figure9, command_watch  # noqa: E402
-from speed import ROBOTS, command_table3  # noqa: E402
 
 # ------------------------------------------------------ runs, many at a time, each only once
 
@@ -112,62 +114,99 @@ def attempt(function, run, home):
         if os.getppid() == home and sys.platform == "linux":  # ends with it
             ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG, SIGKILL
     began = time.time()
-    with fac.one_thread():
+    with fac.one_thread(), contextlib.redirect_stdout(sys.stderr):
         try:
             settings = json.loads(run["settings"])
             fac.need(settings.get("data") == made_from(run["task"], settings),
                      f"data/{run['task']} or a default has changed; give the command again")
             settings.pop("data", None)
             found = list(function(run["task"], int(run["seed"]), run["case"], settings))
+            fac.need(all(np.isfinite(v) for row in found for v in row.values()
+                         if isinstance(v, float)), f"found {found[-1]}, not finite")
             found[-1].setdefault("minutes", (time.time() - began) / 60)
         except Exception as error:
-            found = [{"error": f"{type(error).__name__}: {' '.join(str(error).split())}"}]
+            return failed(run, error)
     return [{**run, **row} for row in found]
+
+
+def failed(run, error):
+    """The rows of a run that ended so."""
+    return [{**run, "error": f"{type(error).__name__}: {' '.join(str(error).split())}"}]
+
+
+def in_processes(function, runs, jobs):
+    """Rows of each run as it ends, in so many processes here. One that dies takes the others with
+    it: runs that were begun are made again, each alone, which shows the one at fault."""
+    import joblib
+    todo = {tuple(run.values()): run for run in runs}
+    while todo:
+        begun, parallel = {}, joblib.Parallel(  # a kill leaves no queue behind
+            jobs, return_as="generator_unordered", batch_size=1, pre_dispatch="n_jobs")
+        try:
+            for rows in parallel(joblib.delayed(attempt)(function, begun.setdefault(*item),
+                                                         os.getpid()) for item in [*todo.items()]):
+                del todo[tuple(rows[0][k] for k in KEY)]
+                yield rows
+        except BrokenExecutor as error:
+            suspects = [todo.pop(key) for key in [*begun] if key in todo]
+            fac.need(suspects, f"processes die before their runs begin: {error}")
+            for run in suspects:
+                yield from (in_processes(function, [run], jobs) if suspects[1:] else
+                            [failed(run, error)])
+
+
+def connect(address):
+    """A dask cluster's client; UserError if there is none, or it lacks what runs need."""
+    with fac.optional("dask", "cluster"):
+        from dask.distributed import Client
+    try:
+        client = Client(address, timeout=10)
+    except (OSError, ValueError, TypeError) as error:
+        raise fac.UserError(f"--scheduler {address}: {error}") from None
+    known = importlib.util.find_spec, "baselines"
+    fac.need(all([client.run_on_scheduler(*known), *client.run(*known).values()]),
+             f"--scheduler {address}: it or a worker lacks data/ on its PYTHONPATH")
+    return client
+
+
+def on_cluster(function, runs, client):
+    """Rows of each run as it ends on a dask cluster."""
+    from dask.distributed import as_completed
+    with client:
+        futures = {client.submit(attempt, function, run, os.getpid(), pure=False): run
+                   for run in runs}
+        for future in as_completed(futures):
+            fac.need(not future.cancelled(), "the connection to the scheduler is lost; the same "
+                     "command makes what is missing")
+            error = future.exception()
+            yield failed(futures[future], error) if error else future.result()
 
 
 def run_all(args, function, runs):
     """function(task, seed, case, settings), rows, of all runs that the CSV doesn't hold; result."""
     with fac.optional("joblib", "experiments"):
-        import joblib
+        import joblib  # noqa: F401
     for task in args.tasks:
         fac.lookup_task(task)
-    path = Path(args.out or RESULTS / f"{args.command}.csv")
-    done, failed, where = finished(read_rows(path)), [], connect(args)
-    runs = unique(runs)
+    path, errors = Path(args.out or RESULTS / f"{args.command}.csv"), []
+    done, runs = finished(read_rows(path)), unique(runs)
     todo = [run for run in runs if tuple(run.values()) not in done]
+    if args.command in REPORTS:
+        one_figure(path, [*(key for key in done if key[0] in args.tasks),
+                          *(tuple(run.values()) for run in todo)], VARIED.get(args.command, ()))
     append_rows(path, [])  # what can't be written is missed now
-    with fac.progress(args.command, len(runs), "run", len(runs) - len(todo)) as bar, \
-            joblib.parallel_config(**where):
-        parallel = joblib.Parallel(  # a kill leaves no queue behind
-            max(1, min(args.jobs, len(todo))), return_as="generator_unordered", batch_size=1,
-            pre_dispatch="n_jobs")
-        try:
-            for rows in parallel(joblib.delayed(attempt)(function, run, os.getpid())
-                                 for run in todo):
-                append_rows(path, rows)
-                failed += [row["error"] for row in rows if row.get("error")]
-                bar.update()
-        except BrokenExecutor as error:
-            raise fac.UserError(f"a worker process died ({' '.join(str(error).split())[:120]}); "
-                                "the same command makes what is missing") from None
-    for error in failed:
+    address = getattr(args, "scheduler", None)
+    ended = (on_cluster(function, todo, connect(address)) if address else
+             in_processes(function, todo, max(1, min(args.jobs, len(todo)))))
+    with fac.progress(args.command, len(runs), "run", len(runs) - len(todo)) as bar:
+        for rows in ended:
+            append_rows(path, rows)
+            errors += [row["error"] for row in rows if row.get("error")]
+            bar.update()
+    for error in errors:
         print(f"failed: {error}", file=sys.stderr)
-    print(f"{path}: {len(runs)} runs, {len(todo)} of them now, {len(failed)} failed")
-    return {"out": str(path), "runs": len(runs), "now": len(todo), "failed": len(failed)}
-
-
-def connect(args):
-    """joblib's arguments for where runs run: processes here, or a dask cluster."""
-    backend, address = getattr(args, "backend", "loky"), getattr(args, "scheduler", None)
-    if backend == "dask":
-        with fac.optional("dask", "cluster"):
-            from dask.distributed import Client
-        fac.need(address, "--backend dask needs --scheduler tcp://HOST:PORT")
-        try:
-            Client(address, timeout=10)
-        except (OSError, ValueError) as error:
-            raise fac.UserError(f"--scheduler {address}: {error}") from None
-    return {"backend": backend}
+    print(f"{path}: {len(runs)} runs, {len(todo)} of them now, {len(errors)} failed")
+    return {"out": str(path), "runs": len(runs), "now": len(todo), "failed": len(errors)}
 
 
 def planning_for(header, about):
@@ -294,6 +333,8 @@ def command_departures(args):
 def command_sweep(args):
     """sweep: a grid of distill's settings."""
     known, grid = {f.name: f for f in dataclasses.fields(fac.DistillConfig)}, []
+    fac.need((args.backend == "dask") == bool(args.scheduler),
+             "--backend dask and --scheduler tcp://HOST:PORT need each other")
     for text in args.set:
         name, equals, values = text.partition("=")
         name = name.replace("-", "_")
@@ -434,6 +475,9 @@ def command_figure8(args):
 
 # ---------------------------------------------------------- Figure 12: distilling on the way
 
+DECISIONS = {"walker-walk": 48_000}  # whose expert has risen late
+
+
 def online(task, seed, decisions, episodes):
     """train_expert.py's arguments for a run of Figure 12; a number for all that they set."""
     import train_expert
@@ -459,10 +503,12 @@ def follow(task, seed, case, settings):
 
 def command_figure12(args):
     """figure12: online distillation (C.1)."""
-    fac.need(args.decisions % 2000 == 0, f"--decisions: a multiple of 2000, not {args.decisions}")
-    about = {"decisions": args.decisions, "episodes": args.episodes}
+    fac.need(not args.decisions or args.decisions % 2000 == 0,
+             f"--decisions: a multiple of 2000, not {args.decisions}")
+    about = {task: {"decisions": args.decisions or DECISIONS.get(task, 30_000),
+                    "episodes": args.episodes} for task in args.tasks}
     return run_all(args, follow, [
-        make_run(task, seed, "online", data=online(task, seed, **about)[1], **about)
+        make_run(task, seed, "online", data=online(task, seed, **about[task])[1], **about[task])
         for seed, task in itertools.product(args.seeds, args.tasks)])
 
 
@@ -480,23 +526,38 @@ CASES = [*FIGURE4, *FIGURE5_CASES]
 BUDGET = ("data", "steps", "evaluations", "episodes", "samples", "iterations", "decisions")
 
 
-def settled(path, but=()):
-    """A CSV's finished runs; UserError if they don't belong in one figure: a seed's were made with
-    other students, a case's with other settings than `but`, a task's with another budget."""
-    rows, seen = finished(read_rows(path)), {}
-    for task, seed, case, settings in rows:
-        about = {k: v for k, v in json.loads(settings).items() if k not in but}
+VARIED = {"figure7": ("samples", "iterations"), "figure8": ("joint", "kind")}
+
+
+def one_figure(path, keys, varied):
+    """UserError if runs don't belong in one figure: a seed's were made with other students, a
+    case's with other settings than `varied`, a task's with another budget. Budgets by task."""
+    seen = {}
+    for task, seed, case, settings in keys:
+        about = {k: v for k, v in json.loads(settings).items() if k not in varied}
         weights, budget = about.pop("weights", None), {k: about.get(k) for k in BUDGET}
         for key, found in (((seed, case), {"weights": weights}), ((case,), about), ((), budget)):
             other, of, at = seen.setdefault((task, *key), (found, case, seed))
             odd = [k for k in {**other, **found} if other.get(k) != found.get(k)]
             fac.need(not odd, f"{path}: {of} of {task}, seed {at}, was made with "
                      f"{ {k: other.get(k) for k in odd} }, {case}, seed {seed}, with "
-                     f"{ {k: found.get(k) for k in odd} }; delete the rows that are of no use")
-    for (task, *rest), (found, *_) in seen.items():
-        if not rest and found["data"] != made_from(task, found):
+                     f"{ {k: found.get(k) for k in odd} }; give one --out for each, or delete rows")
+    return {task: found for (task, *rest), (found, *_) in seen.items() if not rest}
+
+
+def settled(path, varied=()):
+    """A CSV's finished runs, of one figure; without seeds that lack some of what is varied."""
+    rows = finished(read_rows(path))
+    for task, budget in one_figure(path, rows, varied).items():
+        if budget["data"] != made_from(task, budget):
             print(f"{path}: {task} was made with other data or defaults than now", file=sys.stderr)
-    return rows
+    whole = {}  # by task and case: how many runs its seeds have at most
+    for (task, _, case), count in (have := Counter(key[:3] for key in rows)).items():
+        whole[task, case] = max(count, whole.get((task, case), 0))
+    parts = [key for key, count in have.items() if varied and count < whole[key[0], key[2]]]
+    for task, seed, case in parts:
+        print(f"{path}: {case} of {task}, seed {seed}, isn't whole: left out", file=sys.stderr)
+    return {key: own for key, own in rows.items() if key[:3] not in parts}
 
 
 def curves(rows, column="return_mean"):
@@ -578,7 +639,7 @@ def cell(found):
 
 
 def report_curves(name, path, figures):
-    """Figures 4, 5, 12 and 13: curves; result {task: {case: last}} and Markdown."""
+    """Figures 4, 5, 12, 13, departures: curves; result {task: {case: last}} and Markdown."""
     rows = settled(path)
     found, ranks = curves(rows), curves(rows, "rank_return")
     levels = {task: None if name == "figure12" else expert_level(task, rows) for task in found}
@@ -633,7 +694,7 @@ def follow_up(rows, task):
 
 def report_figure7(_, path, figures):
     """Figure 7: the smallest budget, by milliseconds, that keeps 0.95 of the full one's return."""
-    rows, cells = settled(path, ("samples", "iterations")), {}
+    rows, cells = settled(path, VARIED["figure7"]), {}
     for (task, _, case, settings), own in rows.items():
         about = json.loads(settings)
         into = cells.setdefault(task, {}).setdefault(case, {}).setdefault(
@@ -676,7 +737,7 @@ def report_figure7(_, path, figures):
 
 def report_figure8(_, path, figures):
     """Figure 8: bars of the return with each action dimension disturbed; means over these."""
-    rows, cells = settled(path, ("joint", "kind")), {}
+    rows, cells = settled(path, VARIED["figure8"]), {}
     for (task, _, case, settings), own in rows.items():
         about = json.loads(settings)
         cells.setdefault(task, {}).setdefault(case, {}).setdefault(
@@ -754,19 +815,9 @@ def make_parser():
     parser = fac.Parser(prog="experiments.py", description="The paper's tables and figures, each "
                         "by one command.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="EXPERIMENT")
-    positive, several, ten = (functools.partial(fac.natural, least=n) for n in (1, 2, 10))
-    sub = fac.add_command(
-        commands, "table3", command_table3, "Planning speed: Table 3 (the networks) and whole "
-        "decisions, centralized and factored, in one process and in several.",
-        epilog="Weights are fresh, without a policy. Keep the machine quiet, read ratios.",
-        aliases=["figure6"])
-    sub.add_argument("--robots", nargs="+", default=list(ROBOTS), choices=ROBOTS, metavar="ROBOT",
-                     help="some of: " + ", ".join(ROBOTS) + " [all]")
-    sub.add_argument("--workers", type=fac.natural, help="beside this process [as many as help]")
-    sub.add_argument("--runs", type=ten, default=100, help="timings; of decisions a tenth [100]")
-    sub.add_argument("--figure", help="draw it into this file [figure6: data/figures/figure6.png]")
-    fac.add_config(sub, fac.PlannerConfig, skip=("pi_trajs",),
-                   **fac.paper_preset(fac.PlannerConfig))
+    positive = functools.partial(fac.natural, least=1)
+    speed.add_commands(commands)
+
     def add_runs(name, run, help, tasks, **defaults):
         sub = fac.add_command(commands, name, run, help, epilog="The same command again makes "
                               "the runs that are missing in the CSV, and only these.")
@@ -775,9 +826,9 @@ def make_parser():
         sub.add_argument("--seeds", nargs="+", type=fac.natural, default=[0, 1, 2],
                          metavar="SEED", help="[0 1 2]")
         sub.add_argument("--jobs", type=positive, default=fac.cores(),
-                         help="runs at a time, of --backend loky [one for each core]")
+                         help="runs at a time [one for each core]")
         sub.add_argument("--out", help=f"the CSV [data/results/{name}.csv]")
-        sub.add_argument("--episodes", type=positive, default=defaults.get("episodes", 10),
+        sub.add_argument("--episodes", type=positive, default=defaults["episodes"],
                          help="of each evaluation [%(default)s]")
         if "steps" in defaults:
             sub.add_argument("--steps", type=positive, default=defaults["steps"],
@@ -789,74 +840,48 @@ def make_parser():
                                  f"[{getattr(fac.PlannerConfig, name)}]")
         return sub
 
-    walkers, steps = ["walker-walk", "walker-run"], fac.DistillConfig.steps
+    walkers = ["walker-walk", "walker-run"]
+    curve = {"steps": 5000, "evaluations": 4, "episodes": 5}
     shipped = sorted(path.parent.name for path in fac.DATA.glob("*/expert.npz"))
     add_runs("figure4", lambda args: distil_all(args, lambda _: FIGURE4.items()),
              "Section 5.2: Fac-TDMPC, TD-MPC in Table 2's size and the small one of B.2, and TAP, "
-             "by Algorithm 1; return against steps.", shipped, steps=steps, evaluations=4)
+             "by Algorithm 1; return against steps.", shipped, **curve)
     add_runs("figure5", lambda args: distil_all(args, lambda _: FIGURE5_CASES.items()),
              "Section 5.3: KL against MSE, the perturbations' deviation (clipped), the student's "
-             "temperature, a consistency loss.", walkers, steps=steps, evaluations=4)
+             "temperature, a consistency loss.", walkers, **curve)
     add_runs("departures", command_departures, "The differences in distillation one at a time, "
-             "towards the paper's values.", ["reacher-hard", "walker-walk"], steps=steps,
-             evaluations=1)
-    for name, run, help in (
+             "towards the paper's values.", ["reacher-hard", "walker-walk"],
+             steps=5000, evaluations=1, episodes=10)
+    for name, run, help, episodes in (
             ("figure7", command_figure7, "Section 5.4: samples and iterations, expert and student: "
-             "returns, then milliseconds (keep the machine quiet for these)."),
+             "returns, then milliseconds (keep the machine quiet for these).", 4),
             ("figure8", command_figure8, "Section 5.5: one action dimension is noise, or its motor "
-             "half or one and a half times as strong.")):
-        sub = add_runs(name, run, help, walkers)
+             "half or one and a half times as strong.", 5)):
+        sub = add_runs(name, run, help, walkers, episodes=episodes)
         sub.add_argument("--students", default="runs", help="where distill left TASK-SEED/ [runs]")
     sub = add_runs("figure12", command_figure12, "Appendix C.1: an expert that learns and a "
-                   "student that follows it.", ["reacher-easy", "walker-walk", "cheetah-run"])
-    sub.add_argument("--decisions", type=positive, default=30_000,
-                     help="of training, a multiple of 2000 [30000]")
+                   "student that follows it.", ["reacher-easy", "walker-walk", "cheetah-run"],
+                   episodes=10)
+    sub.add_argument("--decisions", type=positive,
+                     help="of training, a multiple of 2000 [30000; walker-walk: 48000]")
     add_runs("figure13", command_figure13, "Appendix C.2: the number of agents.", walkers,
-             steps=steps, evaluations=4)
+             **curve)
     for name in ("figure7", "figure13"):
         add = commands.choices[name].add_argument
         add("--rounds", type=positive, default=20, help="timings of each [20]")
     sub = add_runs("sweep", command_sweep, "A grid over Algorithm 1's settings and num-agents.",
-                   ["reacher-hard"], steps=steps, evaluations=1)
+                   ["reacher-hard"], steps=fac.DistillConfig.steps, evaluations=1, episodes=10)
     sub.add_argument("--set", nargs="+", required=True, metavar="SETTING=VALUE,...",
                      help="e.g. lr=1e-3,3e-4 batch-size=16,32; see distill --help")
     sub.add_argument("--backend", choices=("loky", "dask"), default="loky", help="processes of "
-                     "this machine, or a cluster whose workers (--nthreads 1) have this "
-                     "repository and its data/ on their PYTHONPATH [loky]")
-    sub.add_argument("--scheduler", help="the cluster's, tcp://HOST:PORT")
+                     "this machine, or a cluster whose scheduler and workers (--nthreads 1) have "
+                     "this repository and its data/ on their PYTHONPATH [loky]")
+    sub.add_argument("--scheduler", help="dask's, tcp://HOST:PORT")
     sub = fac.add_command(commands, "report", command_report, "Tables and figures from the CSVs: "
                           "data/results/report.md, data/figures/figure*.png.")
     sub.add_argument("--results", default=RESULTS, help="where the CSVs are [data/results]")
     sub.add_argument("--figures", default=fac.DATA / "figures", help="[data/figures]")
-    sub = fac.add_command(
-        commands, "watch", command_watch, "An episode as a moving picture: beside the robot a bar "
-        "for each agent, what a plan made anew is worth above doing nothing (each model has its "
-        "scale); below, a decision's time.")
-    sub.add_argument("--model", required=True, help="an expert.npz or student.npz")
-    sub.add_argument("--beside", help="another one, on the same episode")
-    sub.add_argument("--task", help="one of: " + ", ".join(fac.TASKS) + " [the model's own]")
-    sub.add_argument("--seed", type=fac.natural, default=0, help="of the evaluation [0]")
-    sub.add_argument("--episode", type=fac.natural, default=0, help="of that evaluation [0]")
-    sub.add_argument("--decisions", type=positive, default=150, help="[150]")
-    sub.add_argument("--every", type=positive, default=2, help="decisions between two frames [2]")
-    sub.add_argument("--out", required=True, help="a .gif or an .mp4 file")
-    for name, run, help, episodes in (
-            ("figure9", command_figure9, "Section 5.6: latents by joint (t-SNE, PCA), and each "
-             "joint's return in the best and the worst episode.", 100),
-            ("agreement", command_agreement, "Rank correlation of each joint's share with the "
-             "expert's Q when that joint alone moves: in held-out states, and through the "
-             "student's worst episode.", 20)):
-        sub = fac.add_command(commands, name, run, help)
-        sub.add_argument("--model", required=True, help="a student.npz")
-        sub.add_argument("--task", help="one of: " + ", ".join(fac.TASKS) + " [the model's own]")
-        sub.add_argument("--seed", type=fac.natural, default=0, help="of the episodes [0]")
-        sub.add_argument("--episodes", type=positive, default=episodes, help="[%(default)s]")
-        sub.add_argument("--out", default=f"{name}.png", help="the picture [%(default)s]")
-    sub.add_argument("--expert", help="the expert's file or folder [data/TASK]")
-    sub.add_argument("--replay", help="[replay.npz beside the expert]")
-    sub.add_argument("--states", type=positive, default=256, help="held-out ones [%(default)s]")
-    commands.choices["figure9"].add_argument("--points", type=several, default=500,
-                                             help="states that are drawn [%(default)s]")
+    look.add_commands(commands)
     return parser
 
 

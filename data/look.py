@@ -102,7 +102,8 @@ def command_watch(args):
         fac.check_task(models[1][1].config, task, args.beside)
     choose_renderer()
     environment = fac.Environment(task)
-    seed = fac.episode_seeds(args.seed, args.episode + 1)[args.episode]
+    seed = np.random.SeedSequence(args.seed, spawn_key=(args.episode,))  # `fac.episode_seeds`'
+    seed = int(seed.generate_state(1)[0])
     episodes = [watch_episode(*found, environment, seed, args.decisions, args.every)
                 for found in models]
     images = draw_frames(episodes)
@@ -307,3 +308,38 @@ def open_model(args, **kinds):
     fac.need(task := args.task or header.get("task"), f"{args.model}: header: no task; pass --task")
     fac.check_task(model.config, task, args.model)
     return model, header, task
+
+
+def add_commands(commands):
+    """The three sub-commands' arguments."""
+    positive = functools.partial(fac.natural, least=1)
+    sub = fac.add_command(
+        commands, "watch", command_watch, "An episode as a moving picture: beside the robot a bar "
+        "for each agent, what a plan made anew is worth above doing nothing (each model has its "
+        "scale); below, a decision's time.")
+    sub.add_argument("--model", required=True, help="an expert.npz or student.npz")
+    sub.add_argument("--beside", help="another one, on the same episode")
+    sub.add_argument("--task", help="one of: " + ", ".join(fac.TASKS) + " [the model's own]")
+    sub.add_argument("--seed", type=fac.natural, default=0, help="of the evaluation [0]")
+    sub.add_argument("--episode", type=fac.natural, default=0, help="of that evaluation [0]")
+    sub.add_argument("--decisions", type=positive, default=150, help="[150]")
+    sub.add_argument("--every", type=positive, default=2, help="decisions between two frames [2]")
+    sub.add_argument("--out", required=True, help="a .gif or an .mp4 file")
+    for name, run, help, episodes in (
+            ("figure9", command_figure9, "Section 5.6: latents by joint (t-SNE, PCA), and each "
+             "joint's return in the best and the worst episode.", 100),
+            ("agreement", command_agreement, "Rank correlation of each joint's share with the "
+             "expert's Q when that joint alone moves: in held-out states, and through the "
+             "student's worst episode.", 20)):
+        sub = fac.add_command(commands, name, run, help)
+        sub.add_argument("--model", required=True, help="a student.npz")
+        sub.add_argument("--task", help="one of: " + ", ".join(fac.TASKS) + " [the model's own]")
+        sub.add_argument("--seed", type=fac.natural, default=0, help="of the episodes [0]")
+        sub.add_argument("--episodes", type=positive, default=episodes, help="[%(default)s]")
+        sub.add_argument("--out", default=f"{name}.png", help="the picture [%(default)s]")
+    sub.add_argument("--expert", help="the expert's file or folder [data/TASK]")
+    sub.add_argument("--replay", help="[replay.npz beside the expert]")
+    sub.add_argument("--states", type=positive, default=256, help="held-out ones [%(default)s]")
+    commands.choices["figure9"].add_argument(
+        "--points", type=functools.partial(fac.natural, least=2), default=500,
+        help="states that are drawn [%(default)s]")

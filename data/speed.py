@@ -251,3 +251,20 @@ def draw_prediction(path, prediction, robots):
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     axes[-1].set_xticks(range(len(robots)), [f"{r}\nN = {ROBOTS[r][1]}" for r in robots])
     fac.save_figure(path, figure)
+
+
+def add_commands(commands):
+    """The sub-command's arguments."""
+    sub = fac.add_command(
+        commands, "table3", command_table3, "Planning speed: Table 3 (the networks) and whole "
+        "decisions, centralized and factored, in one process and in several.",
+        epilog="Weights are fresh, without a policy. Keep the machine quiet, read ratios.",
+        aliases=["figure6"])
+    sub.add_argument("--robots", nargs="+", default=list(ROBOTS), choices=ROBOTS, metavar="ROBOT",
+                     help="some of: " + ", ".join(ROBOTS) + " [all]")
+    sub.add_argument("--workers", type=fac.natural, help="beside this process [as many as help]")
+    sub.add_argument("--runs", type=functools.partial(fac.natural, least=10), default=100,
+                     help="timings; of decisions a tenth [100]")
+    sub.add_argument("--figure", help="draw it into this file [figure6: data/figures/figure6.png]")
+    fac.add_config(sub, fac.PlannerConfig, skip=("pi_trajs",),
+                   **fac.paper_preset(fac.PlannerConfig))

@@ -178,6 +178,41 @@ def test_a_failed_run_is_a_row_and_is_tried_again(tmp_path):
     assert len(rows) == 3 and len(rows_of(tmp_path / "sweep.csv")) == 1
 
 
+def seven_but_one_dies():
+    """A function of runs whose second seed ends its process, and four seeds' runs."""
+    def function(task, seed, case, settings):
+        if seed == 1:
+            os.kill(os.getpid(), 9)
+        print("a table")
+        yield {"return_mean": 7.0}
+
+    return function, [experiments.make_run("cheetah-run", seed, "x") for seed in range(4)]
+
+
+def test_a_run_whose_process_dies_is_a_row_and_stops_nothing(capfd):
+    pytest.importorskip("joblib")
+    found = list(experiments.in_processes(*seven_but_one_dies(), 2))
+    rows = {row["seed"]: row for (row,) in found}
+    assert len(found) == len(rows) == 4 and "SIGKILL" in rows["1"]["error"]
+    assert all(rows[seed]["return_mean"] == 7 and rows[seed]["minutes"] >= 0 for seed in "023")
+    assert capfd.readouterr().out == ""  # the last line is the command's own
+
+
+def test_a_run_without_a_finite_return_has_failed():
+    run = experiments.make_run("cheetah-run", 0, "x")
+    (row,) = experiments.attempt(lambda *_: [{"return_mean": float("nan")}], run, os.getpid())
+    assert "not finite" in row["error"] and "minutes" not in row
+
+
+def test_a_run_that_does_not_fit_its_figure_is_refused_before_the_work(tmp_path):
+    pytest.importorskip("joblib")
+    write_rows(tmp_path / "4.csv", [("walker-run", 0, "TAP", {"steps": 3}, [{"minutes": 1.0}])])
+    before = (tmp_path / "4.csv").read_bytes()
+    refused(run("figure4", "--tasks", "walker-run", "--out", "4.csv", cwd=tmp_path), "4.csv: TAP",
+            "'steps': 3", "'steps': 5000", "--out")
+    assert (tmp_path / "4.csv").read_bytes() == before
+
+
 @pytest.mark.parametrize("column, value", [
     ("return_mean", "nan"), ("step", "x"), ("settings", "[]"), ("settings", "{")])
 def test_a_damaged_row_is_shown(tmp_path, column, value):
@@ -223,20 +258,23 @@ def test_workers_end_with_the_process_that_waits_for_them(tmp_path):
     assert not workers()
 
 
-def test_dask_gives_the_rows_that_processes_give(tmp_path):
+def test_dask_gives_the_rows_that_processes_give(tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed")
     pytest.importorskip("joblib")
     flags = ["sweep", *SMALL, "--set", *SET, "num-agents=3,6"]
     last_json(run(*flags, "--json", cwd=tmp_path))
     here = rows_of(tmp_path / "sweep.csv")
-    os.environ["PYTHONPATH"] = str(ROOT / "data")
-    try:
-        with distributed.LocalCluster(n_workers=2, threads_per_worker=1,
-                                      dashboard_address=None) as cluster:
-            last_json(run(*flags, "--out", "dask.csv", "--backend", "dask", "--scheduler",
-                          cluster.scheduler_address, "--json", cwd=tmp_path))
-    finally:
-        del os.environ["PYTHONPATH"]
+    monkeypatch.setenv("PYTHONPATH", str(ROOT / "data"))
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1,
+                                  dashboard_address=None) as cluster:
+        address = cluster.scheduler_address
+        last_json(run(*flags, "--out", "dask.csv", "--backend", "dask", "--scheduler", address,
+                      "--json", cwd=tmp_path))
+        cluster.scheduler.allowed_failures = 0
+        function, runs = seven_but_one_dies()
+        ((row,),) = experiments.on_cluster(function, runs[1:2],
+                                               experiments.connect(address))
+    assert row["seed"] == "1" and row["error"].startswith("KilledWorker")
     assert rows_of(tmp_path / "dask.csv") == here and len(here) == 2
 
 
@@ -248,7 +286,9 @@ def test_dask_gives_the_rows_that_processes_give(tmp_path):
     (["sweep", "--set", "kl=sideways"], ["kl", "sideways"]),
     (["sweep", "--set", "num-agents=3,7"], ["num_agents", "[1, 3]", "not 7"]),
     (["sweep", "--set", "lr=1e-3", "--backend", "dask"], ["--scheduler"]),
+    (["sweep", "--set", "lr=1e-3", "--scheduler", "tcp://host:1"], ["--backend dask"]),
     (["sweep", "--set", "lr=1e-3", "--backend", "dask", "--scheduler", "nowhere"], ["nowhere"]),
+    (["sweep", "--set", "lr=1e-3", "--backend", "dask", "--scheduler", "tls://host:1"], ["tls"]),
     (["figure4", "--tasks", "reecher-hard"], ["reecher-hard", "reacher-hard"]),
     (["figure5", "--jobs", "0"], ["--jobs"]),
     (["figure7", "--tasks", "walker-run", "--seeds", "7"], ["walker-run-7", "distill"]),
@@ -561,6 +601,16 @@ def test_what_a_student_was_made_with_tells_it_apart():
                    {"training": {"discount": 0.5}}):
         seen.add(experiments.identity(model, header)["made"])
     assert len(seen) == 5
+
+
+def test_a_seed_that_lacks_runs_is_left_out(tmp_path, capsys):
+    path = tmp_path / "figure7.csv"
+    write_rows(path, [("walker-run", seed, "student", {"samples": samples, "iterations": 6}, [
+        {"return_mean": 1.0, "minutes": 1.0}])
+        for seed, samples in ((0, 512), (0, 256), (1, 512))])
+    found = experiments.settled(path, experiments.VARIED["figure7"])
+    assert [key[1] for key in found] == ["0", "0"]
+    assert "student of walker-run, seed 1, isn't whole: left out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("left", ["", "task,se"])
