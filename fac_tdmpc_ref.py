@@ -2,10 +2,9 @@
 
 A TD-MPC expert (encoder, dynamics, reward, value; planning by MPPI in latent space) is distilled
 into a student whose latent state, dynamics, reward and value fall apart into one small model for
-each action dimension. Each joint then plans alone: cheaper, and in parallel. This file holds the
-method: networks with hand-written gradients, Adam, Algorithm 1 (Equation 4), MPPI (Equations 2 and
-3), planning workers, environments, files and two commands. What uses it is in data/: training
-experts (Equation 1), the paper's experiments, checkpoints from elsewhere.
+each action dimension. Each joint then plans alone: cheaper, and in parallel. Here is the method:
+networks with hand-written gradients, Adam, Algorithm 1 (Equation 4), MPPI (Equations 2 and 3),
+planning workers, environments, files, two commands. What uses it, Equation 1 too, is in data/.
 
     python fac_tdmpc_ref.py distill --task reacher-hard
     python fac_tdmpc_ref.py evaluate --model runs/reacher-hard-0/student.npz
@@ -48,6 +47,7 @@ import signal
 import sys
 import tempfile
 import time
+import warnings
 import zlib
 from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
@@ -1224,7 +1224,7 @@ def _run_worker(target, connection):
     with contextlib.suppress(EOFError, ConnectionError), one_thread():  # the parent is gone
         try:
             target(connection)
-        except (UserError, MemoryError) as error:
+        except (UserError, MemoryError, OSError) as error:
             connection.send(UserError(str(error) or "not enough memory"))
 
 
@@ -1456,9 +1456,8 @@ class Replay:
 
     def sequences(self, starts, length):
         """First observations (O, B) and actions (L, A, B), float32, from the rows `starts` on."""
-        obs = self.observation[starts].T.astype(F32)
         actions = self.action[starts + np.arange(length)[:, None]]
-        return obs, actions.swapaxes(1, 2).astype(F32)
+        return self.observation[starts].T.astype(F32), actions.swapaxes(1, 2).astype(F32)
 
 
 def checksum(arrays):
@@ -1498,9 +1497,8 @@ def decisions(model, task, config, seeds, environment=None):
             begin = time.perf_counter()
             action = planner.act(obs)
             seconds = time.perf_counter() - begin
-            after, reward = environment.step(action)
-            yield obs, action, reward, seconds
-            obs = after
+            before, (obs, reward) = obs, environment.step(action)
+            yield before, action, reward, seconds
 
 
 def _playing_worker(connection):
@@ -1597,9 +1595,9 @@ def train_student(distiller, out, settings, playing, workers):
         header, arrays = read_npz(checkpoint, ("checkpoint",))
         try:
             same_settings(header["settings"], settings, checkpoint)
-            curve, before = header["curve"], header["seconds"]
+            curve, before = header["curve"], float(header["seconds"])
             distiller.load(arrays)
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise UserError(f"{checkpoint}: damaged ({error!r}); delete it to start anew") from None
     began = saved = time.time()
     every, losses = max(1, min(250, config.steps // 8)), []
@@ -1708,7 +1706,7 @@ def read_records(path):
     try:
         records = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
         return {key: [float(r) for r in returns] for key, returns in records.items()}
-    except (OSError, ValueError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{path}: not what evaluate --record writes ({error}); delete it") from None
 
 
@@ -1772,7 +1770,7 @@ def distil_and_save(distiller, args, planning, header, out):
     if (path := out / "student.npz").exists():  # a run that this one would replace
         before, _ = read_npz(path, ("student",))
         same_settings({key: before.get(key) for key in settings}, settings, path)
-    elif (path := out / "config.json").exists() and not (out / "checkpoint.npz").exists():
+    elif not (out / "checkpoint.npz").exists() and (path := next(out.glob("*.json"), None)):
         raise UserError(f"{path}: not this run's, which would replace it; choose another --out")
     print(f"{args.task}: {student.config.num_agents} agents, {len(distiller.optimizer.vector):,} "
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
@@ -1850,8 +1848,7 @@ def print_table(rows):
     """Columns as wide as they need to be; the first to the left, the others to the right."""
     widths = [max(map(len, column)) for column in zip(*rows)]
     for row in rows:
-        print("  ".join(cell.ljust(w) if i == 0 else cell.rjust(w)
-                        for i, (cell, w) in enumerate(zip(row, widths))))
+        print("  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]))
 
 
 def command_evaluate(args):
@@ -1973,21 +1970,23 @@ def make_parser():
 def run_command(parser, argv=None):
     """Run a command line; returns the exit status: 2, with one line, for what the user can mend."""
     args = parser.parse_args(argv)
+    warnings.simplefilter("ignore", RuntimeWarning)  # what isn't finite is refused in one line
     if hasattr(sys.stdout, "reconfigure"):  # a terminal that has no ±
         sys.stdout.reconfigure(errors="replace")
     try:
         result = args.run(args)
+        print(json.dumps(result) + "\n" if args.json else "", end="", flush=True)
     except (UserError, MemoryError, OSError) as error:
         if isinstance(error, OSError) and error.filename:
             error = f"{error.filename}: can't be read or written: {error.strerror}"
+        elif isinstance(error, OSError):  # a full stdout's, which would fail again at the end
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         print(f"{parser.prog}: error: {str(error) or 'not enough memory'}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"{parser.prog}: interrupted; the same command goes on from its last checkpoint, "
               f"if it had one", file=sys.stderr)
         return 130
-    if args.json:
-        print(json.dumps(result))
     return 1 if result and result.get("failed") else 0  # an experiment's runs
 
 

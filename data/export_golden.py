@@ -206,13 +206,17 @@ def task_golden(expert, g, config, planner, distill):
 def write_golden(folder):
     """golden.npz of the expert and the replay in a folder."""
     path, rng = folder / "expert.npz", np.random.default_rng(0)
-    expert, header = fac.load_model(path)
+    expert, header = fac.load_model(path, ["expert"])
+    fac.need(expert.has_policy, f"{path}: _pi.0.weight: missing; golden files hold a policy's")
+    replay = fac.Replay(folder / "replay.npz")
+    for sizes, name in ((expert.config, path), (replay, folder / "replay.npz")):
+        fac.check_task(sizes, header.get("task"), name)
     config = fac.from_dict(ExpertConfig, header.get("training", {}), f"{path}: header: training")
     planner = fac.PlannerConfig(samples=64, elites=8, pi_trajs=0)
     distill = fac.DistillConfig(batch_size=8, noise_samples=10, **AS_PRINTED)
     sizes = fac.student_config(expert.config, expert.config.dim_action, distill.sizes, "latent")
     student = alive(fac.WorldModel.create(sizes, rng), rng)
-    g = draw_inputs(expert, fac.Replay(folder / "replay.npz"), student, config, distill, rng)
+    g = draw_inputs(expert, replay, student, config, distill, rng)
     header = {"kind": "golden", "task": header["task"], **{
         name: dataclasses.asdict(values) for name, values in (
             ("training", config), ("planner", planner), ("distill", distill), ("student", sizes))}}
@@ -275,7 +279,8 @@ def run(args):
     """Write the golden files of the tasks, and that of narrow networks."""
     fac.need(torch, "golden files hold what PyTorch computes: pip install torch")
     fac.need(args.data.is_dir(), f"{args.data}: no such folder")
-    tasks = args.tasks or sorted(p.parent.name for p in args.data.glob("*/expert.npz"))
+    tasks = args.tasks or sorted(p.parent.name for p in args.data.glob("*/expert.npz")
+                                 if (p.parent / "replay.npz").exists())
     for task in tasks:
         write_golden(args.data / task)
     write_narrow_golden(args.data / "golden-narrow.npz")

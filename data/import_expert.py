@@ -418,15 +418,17 @@ def run(args):
     for source, name in ((args.file, "expert.npz"), (args.replay, "replay.npz")):
         need(not source or Path(source).resolve() != (out / name).resolve(),
              f"{source}: would be replaced by what is made of it; choose another --out")
-    need(arrays or environment or not (out / "replay.npz").exists(), f"{out / 'replay.npz'}: "
-         "another expert's; choose another --out, or pass --replay or --collect")
+    own = (arrays or environment) and (out / "expert.npz").exists()
+    need(own or not (out / "replay.npz").exists(), f"{out / 'replay.npz'}: another expert's; "
+         "choose another --out, or pass --replay or --collect beside its own expert.npz")
     need(not (out / "checkpoint.npz").exists(), f"{out / 'checkpoint.npz'}: a run of "
          "train_expert.py, whose files would be replaced; choose another --out")
     if (path := out / "expert.npz").exists():
-        _, there = fac.read_npz(path, ("expert", "student"))
-        need(there.keys() == weights.keys() and all(np.array_equal(there[k], weights[k])
-                                                    for k in there),
-             f"{path}: another expert, which would be replaced; choose another --out")
+        before, there = fac.read_npz(path, ("expert", "student"))
+        need(before.get("task") == args.task and there.keys() == weights.keys() and all(
+            np.array_equal(there[k], weights[k]) for k in there),
+            f"{path}: another expert, which would be replaced; choose another --out")
+        header = {**before, **header}
     fac.check_writable(out / "expert.npz")
     if environment and not arrays:
         with tempfile.TemporaryDirectory() as scratch:  # an expert is replaced with its replay
@@ -478,7 +480,8 @@ def main(argv=None):
     data = parser.add_mutually_exclusive_group()
     data.add_argument("--replay", help="an .npz with observation (M, dim O), action (M, dim A) and "
                       "continues (M,), False in each episode's last row")
-    data.add_argument("--collect", type=int, metavar="N", help="have the expert play N episodes")
+    data.add_argument("--collect", type=fac.natural, metavar="N",
+                      help="have the expert play N episodes")
     parser.add_argument("--seed", type=fac.natural, default=0, help="of these episodes [0]")
     parser.add_argument("--json", action="store_true",
                         help="print one JSON object as the last line of stdout")

@@ -438,9 +438,12 @@ class Training:
         """The updates that are left, and an evaluation of what came out."""
         began = time.time()
         self.learn_until(int(self.allowed), bar)
+        self.curve[-1]["updates"] = self.learner.updates
         actors.begin(tests := self.tests())
-        actors.play(fac.EPISODE_STEPS, self.planners())
-        self.note(tests, actors.wait())
+        for played in range(0, fac.EPISODE_STEPS, 25):  # actors notice soon if this process ends
+            actors.play(25, {} if played else self.planners())
+            episodes = actors.wait()
+        self.note(tests, episodes)
         self.seconds += time.time() - began
 
     def save(self, out):
@@ -471,8 +474,9 @@ class Training:
             self.buffer.load(arrays)
             for key in ("decisions", "allowed", "seconds", "curve"):
                 setattr(self, key, header[key])
-        except (KeyError, TypeError, ValueError) as error:
-            raise fac.UserError(f"{path}: damaged ({error!r}); delete it to start anew") from None
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:  # the last is PyTorch's
+            raise fac.UserError(f"{path}: damaged ({error!r}); choose another --out, or empty it"
+                                ) from None
 
 
 def lag(curve, fraction):

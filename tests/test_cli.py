@@ -304,6 +304,7 @@ def test_what_diverges_is_refused_and_leaves_no_weights(tmp_path, files, steps):
                                   "--out", "run", "--json"), cwd=tmp_path)
     assert done.returncode == 2 and done.stdout == "" and "Traceback" not in done.stderr
     assert "diverged; lower the learning rate (1e+38)" in done.stderr.splitlines()[-1]
+    assert "RuntimeWarning" not in done.stderr
     assert not list((tmp_path / "run").glob("*.npz"))
 
 
@@ -555,6 +556,8 @@ def test_a_checkpoint_with_other_settings_is_refused(killed, files, capsys, flag
 
 @pytest.mark.parametrize("spoil", [
     lambda header, arrays: header.pop("curve"), lambda header, arrays: header.update(settings=[1]),
+    lambda header, arrays: header.update(seconds="1 h"),
+    lambda header, arrays: arrays.update(step=np.float64("inf")),
     lambda header, arrays: arrays.pop("weights"),
     lambda header, arrays: arrays.update(weights=np.zeros(3, np.float32))])
 def test_a_damaged_checkpoint_is_named(killed, files, capsys, spoil):
@@ -578,10 +581,11 @@ def test_a_finished_run_is_not_replaced_by_one_with_other_settings(distilled, fi
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_another_program_s_configuration_is_not_replaced(tmp_path, files, capsys):
-    (tmp_path / "config.json").write_text("an hour's work")
+@pytest.mark.parametrize("name", ["config.json", "result.json"])
+def test_another_program_s_files_are_not_replaced(tmp_path, files, capsys, name):
+    (tmp_path / name).write_text("an hour's work")
     assert fac.main([str(a) for a in distill_arguments(files, "--out", tmp_path)]) == 2
-    assert "config.json: not this run's" in capsys.readouterr().err.splitlines()[-1]
+    assert f"{name}: not this run's" in capsys.readouterr().err.splitlines()[-1]
     assert [path.read_text() for path in tmp_path.iterdir()] == ["an hour's work"]
 
 

@@ -1,6 +1,7 @@
 """Long commands whose disk is full: one line that names the file, nothing half written is left,
 and the same command goes on when there is room. A limit on the size of files is the full disk."""
 import os
+import subprocess
 import sys
 
 import pytest
@@ -35,6 +36,27 @@ def full_disk(name, size, script, *arguments, cwd):
     assert f"{name}: can't be written: File too large" in last
     left = [f for _, _, found in os.walk(cwd) for f in found]
     assert not any(f.startswith(".") or f.endswith(".tmp") for f in left), left
+
+
+COMMAND = """
+import sys
+import fac_tdmpc_ref as fac
+parser = fac.Parser(prog="x")
+fac.add_command(parser.add_subparsers(), "x", lambda args: print("a table") or {"a": 1}, "x")
+sys.exit(fac.run_command(parser))
+"""
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
+@pytest.mark.parametrize("flags", [[], ["--json"]])
+@pytest.mark.parametrize("unbuffered", [[], ["-u"]])
+def test_stdout(flags, unbuffered):
+    env = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([sys.executable, *unbuffered, "-c", COMMAND, "x", *flags], cwd=ROOT,
+                              stdout=full, stderr=subprocess.PIPE, text=True, env=env)
+    assert done.returncode == 2
+    assert done.stderr == "x: error: [Errno 28] No space left on device\n"
 
 
 def test_distill(tmp_path, files):

@@ -231,7 +231,7 @@ def test_pytorch_computes_what_the_narrow_file_holds(export_golden):
                     g, 1e-6)
 
 
-def test_the_export_writes_files_of_the_same_entries(tmp_path, export_golden):
+def test_the_export_writes_files_of_the_same_entries(tmp_path, export_golden, capsys):
     (tmp_path / "reacher-hard").mkdir()
     for name in ("expert.npz", "replay.npz"):
         shutil.copy(fac.DATA / "reacher-hard" / name, tmp_path / "reacher-hard")
@@ -243,3 +243,14 @@ def test_the_export_writes_files_of_the_same_entries(tmp_path, export_golden):
         assert {k: (v.shape, v.dtype) for k, v in found.items()} == {
             k: (v.shape, v.dtype) for k, v in expected.items()}
     assert export_golden.main(["--data", str(tmp_path), "walker-walk"]) == 2
+    header, weights = fac.read_npz(tmp_path / "reacher-hard" / "expert.npz", ("expert",))
+    policy = {key for key in weights if key.startswith("_pi")}
+    for i, (changed, without, part) in enumerate((
+            ({"task": None}, set(), "unknown task"), ({}, policy, "_pi.0.weight: missing"),
+            ({"task": "walker-walk"}, set(), "walker-walk has (24, 6)"),
+            ({"kind": "student"}, set(), "'student'"))):
+        fac.write_npz(tmp_path / str(i) / "expert.npz", {**header, **changed},
+                      {key: weights[key] for key in weights.keys() - without})
+        shutil.copy(fac.DATA / "reacher-hard" / "replay.npz", tmp_path / str(i))
+        assert export_golden.main(["--data", str(tmp_path), str(i)]) == 2
+        assert part in capsys.readouterr().err

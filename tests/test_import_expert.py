@@ -9,6 +9,7 @@ import itertools
 import json
 import pickle
 import resource
+import shutil
 import struct
 import sys
 import time
@@ -829,10 +830,17 @@ def test_collected_episodes_distil_and_depend_on_the_seed_alone(tmp_path, capsys
                         ([str(model), "--replay", str(tmp_path / "a" / "replay.npz")],
                          "replay.npz: would be replaced"),
                         ([str(model)], "replay.npz: another expert's; choose another --out"),
+                        ([str(model), "--task", "reacher-hard", "--collect", "3"],
+                         "expert.npz: another expert"),
                         ([str(fac.data_file("reacher-easy", "expert.npz")), "--collect", "3"],
                          "expert.npz: another expert")):
-        assert import_expert.main([*flags, "--task", TASK, "--out", str(tmp_path / "a")]) == 2
+        assert import_expert.main(["--task", TASK, *flags, "--out", str(tmp_path / "a")]) == 2
         assert part in capsys.readouterr().err
+    (tmp_path / "d").mkdir()
+    shutil.copy(tmp_path / "a" / "replay.npz", tmp_path / "d")
+    assert import_expert.main([str(model), "--task", TASK, "--out", str(tmp_path / "d"),
+                               "--collect", "3"]) == 2
+    assert "replay.npz: another expert's" in capsys.readouterr().err
 
     def interrupt(*_):
         raise KeyboardInterrupt

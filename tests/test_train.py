@@ -174,7 +174,7 @@ def test_train_prints_json_and_writes_what_distill_takes(trained, tmp_path):
         rows = list(csv.DictReader(file))
     assert [int(r["decisions"]) for r in rows] == [1000, 2000, 3000]
     assert tuple(rows[0]) == train_expert.CURVE and rows[0]["value"] == ""
-    assert float(rows[-1]["value"]) > 0
+    assert float(rows[-1]["value"]) > 0 and int(rows[-1]["updates"]) == 30
     # every 2000 decisions, and what came out; in the row whose weights were tested
     assert [bool(r["eval_expert"] and r["eval_student"]) for r in rows] == [False, True, True]
     assert fac.Replay(folder / "replay.npz").transitions == 3000
