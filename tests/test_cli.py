@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -590,6 +591,13 @@ def test_another_program_s_files_are_not_replaced(tmp_path, files, capsys, name)
 
 
 # evaluate and the record of the expert ------------------------------------------------
+
+def test_what_is_kept_is_the_student_s_return_by_the_expert_s(monkeypatch):
+    monkeypatch.setattr(fac, "evaluate", lambda *_: {"returns": [4.0, 8.0]})
+    args = SimpleNamespace(task="x", episodes=2, eval_seed=0, workers=0, evaluate_expert=False)
+    found = fac.evaluate_both(None, [9.0, 15.0, 99.0], None, args, None)
+    assert (found["kept"], found["expert_return_std"], found["student_return_std"]) == (0.5, 3, 2)
+
 
 def test_what_stops_several_workers_is_said_once(tmp_path, distilled):
     done = run("evaluate", "--model", distilled[1] / "student.npz", "--episodes", "2",

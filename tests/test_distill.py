@@ -80,6 +80,13 @@ def test_rank_correlation_of_the_expert_with_itself_is_one(replay):
         assert of_q_or_return.shape == (4,) and np.allclose(of_q_or_return, 1, atol=1e-6)
 
 
+def test_rank_correlations_are_spearman_s():
+    from scipy.stats import spearmanr
+    x = np.random.default_rng(0).standard_normal((3, 9))
+    y = np.exp(3 * x) + np.random.default_rng(1).standard_normal((3, 9))
+    np.testing.assert_allclose(fac.spearman(x, y), [spearmanr(a, b)[0] for a, b in zip(x, y)])
+
+
 def test_same_seed_same_student(replay):
     students = [distilled(replay, CONFIG, 5, seed=seed)[0].optimizer.vector for seed in (1, 1, 2)]
     assert np.array_equal(students[0], students[1])
@@ -145,6 +152,48 @@ def test_a_share_of_the_states_is_the_students_own(replay):
                                 or own_episodes(*range(count)))
             next(run), next(run)
             assert asked == [(0, expected)] * bool(expected)
+
+
+def ramp():
+    """An episode: step t's observation is t, its action t / 512, both of which float16 holds."""
+    t = np.arange(fac.EPISODE_STEPS + 1.0)[:, None]
+    return np.repeat(t, 8, 1), np.repeat(t[:-1] / 512, 3, 1)
+
+
+def test_a_student_s_own_actions_begin_where_their_state_is(replay):
+    obs, action = ramp()
+    config = fac.dataclasses.replace(CONFIG, encoder_input="observation", own_share=1.0,
+                                     noise_std=1e-6)
+    with fresh(replay, config) as distiller:
+        distiller.add(obs[None, :-1], action[None])
+        (features,), actions, _ = distiller.draw(0, 0, 64)
+    expected = (features[0] + np.arange(4)[:, None]) / 512
+    played = (np.abs(actions[:, 0] - expected[..., None]) < 1e-4).all(0)
+    assert 0.35 < played.mean() < 0.65  # the others' are the policy's [D8]
+
+
+def test_a_student_plays_no_own_episode_twice(replay, tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(fac, "play", lambda model, task, planning, seeds, *_: (
+        seen.extend(seeds), own_episodes(*range(len(seeds))))[1])
+    monkeypatch.setattr(fac, "rank_correlation", lambda *_: (np.zeros(4), np.zeros(4)))
+    config = fac.dataclasses.replace(CONFIG, steps=8, batch_size=4, own_episodes=2)
+    with fresh(replay, config) as distiller:
+        fac.train_student(distiller, tmp_path, {"task": "x"}, fac.PlannerConfig(), 0)
+    assert seen == fac.training_seeds(0, "own episode", 0, 6) and len(set(seen)) == 6
+
+
+@pytest.mark.parametrize("clip", [True, False])
+def test_perturbed_actions_are_clipped_where_they_should_be(replay, clip):
+    with fresh(replay, fac.dataclasses.replace(CONFIG, clip_actions=clip)) as distiller:
+        assert (np.abs(distiller.draw(0, 0, 64)[1]).max() <= 1) == clip
+
+
+def test_no_two_parts_of_a_pool_share_perturbations(replay):
+    with fresh(replay, CONFIG) as distiller:
+        parts = [distiller.draw(number, part, 8)[1].tobytes()
+                 for number in (0, 1) for part in (0, 1)]
+    assert len(set(parts)) == 4
 
 
 def test_each_state_of_a_pool_is_learned_from_as_often_as_it_says(replay, monkeypatch):

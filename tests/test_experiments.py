@@ -20,12 +20,14 @@ import fac_tdmpc_ref as fac
 import look
 import speed
 import test_cli
+import test_distill
 import train_expert
 from test_cli import BLOCKED, ONE_THREAD, ROOT, last_json, launch, write_expert
 from test_layers import assert_close, numeric_gradient
 from test_planning import random_model
 
 refused = functools.partial(test_cli.refused, program="experiments.py")
+replay = test_distill.replay
 
 
 def run(*arguments, cwd, env=ONE_THREAD):
@@ -344,6 +346,26 @@ def test_every_method_of_figure_4_learns_and_plans():
     assert 0.02 < weights["10% TD-MPC"] / weights["100% TD-MPC"] < 0.04
 
 
+def test_a_run_is_distilled_as_it_says(monkeypatch):
+    seen, made = [], []
+
+    def play(model, task, planning, seeds, *_):
+        seen.append((model.config.num_agents, planning.horizon, planning.samples, seeds))
+        return [np.zeros((len(seeds), fac.EPISODE_STEPS, *shape)) for shape in ((17,), (6,), ())]
+
+    monkeypatch.setattr(fac, "play", play)
+    monkeypatch.setattr(fac, "rank_correlation", lambda *_: (np.arange(3), np.arange(4, 7)))
+    monkeypatch.setattr(experiments, "distiller_of", lambda case: lambda *args: (
+        made.append(args[3:]), fac.Distiller(*args))[1])
+    (row,) = experiments.distil("cheetah-run", 5, "x", {
+        "num_agents": 3, "steps": 4, "batch_size": 2, "horizon": 2, "own_episodes": 1,
+        "samples": 7, "iterations": 1})
+    *own, (*last, evaluated) = seen
+    assert made == [(3, 5)] and last == [3, 2, 7] and evaluated == fac.episode_seeds(0, 10)
+    assert sum((seeds for *_, seeds in own), []) == fac.training_seeds(5, "own episode", 0, 3)
+    assert (row["rank_q"], row["rank_return"]) == (0, 6)
+
+
 def loss_inputs(dtype=np.float64):
     """A small student, features, actions, targets and the expert's latents."""
     rng = np.random.default_rng(0)
@@ -508,7 +530,35 @@ def test_a_disturbed_robot():
     np.testing.assert_allclose(step("0.5", full), expected, atol=1e-6)  # half a motor, whole action
     assert not np.allclose(step("1.5", full), step("0.5", full))
     assert not np.allclose(step("noise", full), step("1.5", 0 * full))
-    np.testing.assert_array_equal(step("noise", full), step("noise", 0 * full))  # unheard
+    for joint, other in ((0, 2), (2, 0)):
+        one, two = np.eye(6)[[joint, other]]
+        np.testing.assert_array_equal(step("noise", one, joint), step("noise", 0 * one, joint))
+        assert not np.allclose(step("noise", two, joint), step("noise", 0 * two, joint))
+        plain.reset(0)
+        np.testing.assert_allclose(step("0.5", two, joint), plain.step(two)[0], atol=1e-6)
+    servos = [e.env.physics.model.actuator_biasprm for e in (
+        fac.Environment("quadruped-walk"),
+        experiments.DisturbedEnvironment("quadruped-walk", 1, "0.5"))]
+    assert servos[0][1].any() and np.array_equal(servos[1][1], servos[0][1] / 2)
+    assert np.array_equal(servos[1][0], servos[0][0])
+
+
+def test_a_run_is_planned_disturbed_and_timed_as_it_says(monkeypatch, tmp_path):
+    seen, made, planner = [], [], fac.Planner
+    monkeypatch.setattr(experiments, "measure", lambda *args: seen.append(args) or {})
+    fac.save_model(tmp_path / "reacher-hard-0" / "student.npz", random_model(), {"kind": "student"})
+    list(experiments.plan_with("reacher-hard", 0, "student", {
+        "samples": 7, "iterations": 2, "episodes": 3, "joint": 1, "kind": "noise",
+        **experiments.identity(random_model(), {})}, tmp_path))
+    ((_, _, planning, count, environment),) = seen
+    assert (planning.samples, planning.iterations, count, environment._joint) == (7, 2, 3, 1)
+    monkeypatch.setattr(fac, "Planner", lambda model, config, **how: (
+        made.append(config.samples), planner(model, config, **how))[1])
+    (row,) = experiments.time_runs([experiments.make_run("x", 0, "expert", samples=7)],
+                                   lambda run: (random_model(1), {}), 1)
+    assert set(made) == {7} and row["ms"] > 0
+    run = experiments.make_run("reacher-hard", 0, "N = 3", num_agents=3)
+    assert experiments.fresh_student(run)[0].config.num_agents == 3
 
 
 def test_figures_7_and_8_plan_with_both_models(tmp_path, monkeypatch, capsys):
@@ -574,6 +624,38 @@ def test_the_cases_of_figure_5_learn_what_they_say():
     assert kinds.pop("MSE") is baselines.MSEDistiller
     assert kinds.pop("consistency") is baselines.ConsistentDistiller
     assert set(kinds.values()) == {fac.Distiller} and len(kinds) == 6
+    assert {k: v for k, v in experiments.FIGURE5_CASES.items() if v} == {
+        **{f"noise {x}": {"noise_std": x} for x in (0.1, 1.0, 2.0)},
+        **{f"T_s {x}": {"temperature_student": x} for x in (0.1, 2.0)}}
+
+
+def test_goals_of_the_consistency_loss_are_the_expert_s_next_latents(replay):
+    expert = random_model(n=1, policy=True)
+    with contextlib.closing(baselines.ConsistentDistiller(expert, replay,
+                                                          test_distill.CONFIG)) as distiller:
+        z, actions, targets = distiller.draw(0, 0, 4)
+    z = np.repeat(z, actions.shape[3], 2)
+    assert len(targets[-1]) == len(actions) == 4
+    for a, after in zip(actions, targets[-1]):
+        z = expert.next(z, a.reshape(1, 3, -1))
+        np.testing.assert_allclose(after.reshape(-1, 6).T, z[0], rtol=1e-4, atol=1e-5)
+
+
+def test_mse_is_a_mean_over_perturbations():
+    x, y = np.random.default_rng(0).standard_normal((2, 4, 5))
+    np.testing.assert_allclose(baselines.squared_error(x, y)[0], ((x - y) ** 2).mean(-1))
+
+
+def test_tap_s_robot_gets_what_its_state_decodes_a_latent_action_to():
+    expert, _ = fac.load_model(fac.data_file("reacher-hard", "expert.npz"))
+    vae = baselines.ActionVAE(50, 3, np.random.default_rng(0))
+    environment = baselines.DecodingEnvironment("reacher-hard", expert, vae)
+    plain, u = fac.Environment("reacher-hard"), np.float32([0.3, -0.8])
+    obs = plain.reset(0)
+    assert np.array_equal(environment.reset(0), obs)
+    for _ in range(3):
+        obs, _ = plain.step(vae.decode(expert.encode(obs[:, None])[0], u[:, None])[:, 0])
+        assert np.array_equal(environment.step(u)[0], obs)
 
 
 @pytest.mark.parametrize("case, seed, setting, found", [
@@ -640,6 +722,32 @@ def write_rows(path, runs):
     for task, seed, case, settings, rows in runs:
         run = experiments.make_run(task, seed, case, **settings)
         experiments.append_rows(path, [{**run, **row} for row in rows])
+
+
+def test_figure_7_judges_means_and_draws_along_its_axes(tmp_path, monkeypatch):
+    drawn = {}
+    monkeypatch.setattr(experiments, "draw_lines", lambda path, panels, *_, **__:
+                        drawn.update(panels))
+    found = ((512, 6, (100.0, 100.0), 8.0), (64, 6, (60.0, 100.0), 4.0),
+             (512, 2, (96.0, 96.0), 6.0))
+    write_rows(tmp_path / "7.csv", [("walker-run", seed, case, {"samples": s, "iterations": i}, [
+        {"return_mean": value[seed], "minutes": 1.0}, {"ms": ms, "ms_workers": ms}])
+        for seed in (0, 1) for case in ("expert", "student") for s, i, value, ms in found])
+    (row,), _ = experiments.report_figure7("", tmp_path / "7.csv", tmp_path)
+    assert row["expert"] == {"samples": 512, "iterations": 2, "ms": 6}
+    assert [set(lines["expert"]) for lines, _ in drawn.values()] == [{512, 64}, {6, 2}]
+
+
+def test_tables_hold_where_curves_end():
+    assert experiments.last({1: [1.0], 2: [3.0, 5.0]}, {1: [0.1], 2: [0.5, 0.25]}) == {
+        "mean": 4, "std": 1, "seeds": 2, "rank_return": 0.375}
+    own = [{"step": str(i), "return_mean": value, "expert_mean": "10"}
+           for i, value in enumerate(("1", "9"))]
+    runs = {("walker-walk", "0", "online", "{}"): own}
+    assert experiments.follow_up(runs, "walker-walk")[0] == 0.9
+    returns = max(fac.read_records(fac.data_file("walker-run", "expert.npz")).values(), key=len)
+    level = experiments.expert_level("walker-run", [("walker-run", "0", "x", '{"episodes": 2}')])
+    assert level == np.mean(returns[:2]) != np.mean(returns)
 
 
 def test_report_draws_what_the_csvs_hold(tmp_path):

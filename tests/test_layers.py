@@ -119,6 +119,15 @@ def small_case(n, batch, steps, kind, rng, expert_latent=0):
     return student, features, actions, targets, config
 
 
+def test_the_divergences_that_a_curve_shows_are_means():
+    student, features, actions, targets, config = small_case(3, 2, 3, "forward",
+                                                             np.random.default_rng(6))
+    _, *found = fac.distill_loss(student, features, actions, targets, config)
+    outputs = fac.predict(student, student.encode_features(features), actions)
+    reward, q1, q2 = (fac.soft_kl(o, t, 0.8, 0.5)[0].mean() for o, t in zip(outputs, targets))
+    np.testing.assert_allclose(found, [reward, (q1 + q2) / 2])
+
+
 @pytest.mark.parametrize("n, batch, steps, kind, latent", [
     (1, 1, 4, "forward", 0), (2, 3, 3, "reverse", 5), (3, 1, 2, "forward", 5),
     (6, 2, 4, "reverse", 0), (3, 2, 1, "forward", 0)])

@@ -344,6 +344,12 @@ def test_dividing_the_search_saves_samples():
 # appendix A.1 -------------------------------------------------------------------------
 
 
+def test_the_search_space_names_who_searched():
+    args = demo.make_parser().parse_args(["--steps", "1", "--ik", "closed-form"])
+    _, result = demo.run_demo(args, demo.planner_config(args))
+    assert all(row["three_agents"] > row["one_agent"] for row in result["search_space"][:3])
+
+
 def test_equations_14_to_18_are_the_derivatives():
     errors = demo.check_derivatives(np.random.default_rng(0))
     assert set(errors) == {"14", "15", "16-17", "18"}

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -67,6 +68,32 @@ def test_elites_are_the_best_of_each_agent():
             sorted(map(tuple, actions[i][..., best].reshape(3, -1).T.tolist()))
         score = np.exp(config.inverse_temperature * (np.sort(G[i])[::-1][:5] - G[i].max()))
         assert np.allclose(np.sort(weights[i])[::-1], score / score.sum(), atol=1e-6)
+
+
+@pytest.mark.parametrize("least", [0.05, 0.5])
+def test_an_iteration_by_hand(least):
+    """Sample 0 of the second one is its mean, sample 1 a tenth of its deviation away."""
+    rng, seen = np.random.default_rng(0), []
+    first = rng.standard_normal((3, 1, 40), np.float32)
+    second = np.zeros_like(first)
+    second[..., 1] = 0.1
+    noise = iter((first, second))
+    stream = SimpleNamespace(standard_normal=lambda *_: next(noise).copy())
+    score = quadratic(np.full((1, 3, 1), 0.3, np.float32))
+    mean = np.full((1, 3, 1), -0.4, np.float32)
+    config = fac.PlannerConfig(samples=40, elites=5, iterations=2, momentum=0.25, min_std=least)
+    fac.mppi(lambda actions: seen.append(actions[0].copy()) or score(actions), mean, config,
+             [stream])
+    G = score(seen[0][None])[0]
+    best = np.argsort(-G)[:5]
+    p = np.exp(0.5 * (G[best] - G.max()))
+    p, elites = p / p.sum(), seen[0][..., best]
+    middle = elites @ p
+    std = np.sqrt((elites - middle[..., None]) ** 2 @ p)
+    assert (std < 0.5).any()
+    np.testing.assert_allclose(seen[1][..., 0], 0.25 * mean[0] + 0.75 * middle, atol=1e-6)
+    np.testing.assert_allclose(seen[1][..., 1] - seen[1][..., 0], 0.1 * np.clip(std, least, 2),
+                               atol=1e-6)
 
 
 def test_proposals_compete():
@@ -154,6 +181,16 @@ def test_warm_start_shifts_by_one():
     assert not planner.mean.any()
 
 
+def test_the_mean_is_executed_where_it_is_asked_for():
+    model = random_model()
+    config = fac.PlannerConfig(samples=32, iterations=1, horizon=2, output="mean")
+    planner, z = fac.AgentPlanner(model, config), model.encode(np.zeros((8, 1), np.float32))
+    planner.reset(np.random.SeedSequence(0).spawn(3))
+    twin = [np.random.Generator(np.random.SFC64(s)) for s in np.random.SeedSequence(0).spawn(3)]
+    mean, _, _ = fac.mppi(fac.Returns(model).start(z, config), planner.mean, config, twin)
+    assert np.array_equal(planner.plan(z), mean[:, 0])
+
+
 @pytest.mark.parametrize("output", ["sampled", "mean"])
 @pytest.mark.parametrize("n", [1, 3])
 def test_same_seed_same_plan(n, output):
@@ -177,6 +214,12 @@ def test_policy_proposals_change_the_plan_of_the_expert_only():
         a, b = (fac.Planner(model, fac.PlannerConfig(samples=16, iterations=1, pi_trajs=p,
                                                      output="mean")).act(obs) for p in (0, 24))
         assert np.array_equal(a, b) != differs
+
+
+def test_noisy_actions_of_a_policy_are_clipped():
+    model = random_model(1, policy=True)
+    z = model.encode(np.zeros((8, 2), np.float32))
+    assert np.abs(fac.policy_rollout(model, z, [np.float32(2)] * 3)).max() == 1
 
 
 def test_an_observation_of_the_wrong_size_is_refused():
@@ -404,11 +447,19 @@ def misses_a_file(connection):
     open("/nonexistent/file")
 
 
+def divides(connection):
+    1 / 0
+
+
 def test_a_worker_s_own_error_is_seen(capfd):
-    with fac.Workers(misses_a_file, 1) as workers:
+    with fac.Workers(divides, 1) as workers:
         with pytest.raises(fac.WorkerError, match="exit code 1"):
             workers.receive(0)
-    assert "FileNotFoundError: [Errno 2]" in capfd.readouterr().err
+    assert "ZeroDivisionError" in capfd.readouterr().err
+    with fac.Workers(misses_a_file, 1) as workers:  # one line, as in the parent
+        with pytest.raises(fac.UserError, match="No such file .*'/nonexistent/file'"):
+            workers.receive(0)
+    assert capfd.readouterr().err == ""
 
 
 def test_a_gain_of_zero_is_a_gain_all_the_same():

@@ -15,6 +15,7 @@ import pytest
 import fac_tdmpc_ref as fac
 import train_expert
 from test_cli import ONE_THREAD, ROOT, WATCHED, last_json, launch, refused, run, succeeded
+from test_distill import ramp
 
 SCRIPT = ROOT / "data" / "train_expert.py"
 
@@ -102,7 +103,9 @@ def test_segments_are_in_order_and_most_get_other_targets():
     assert not reward[:, ~moved].any() and reward[:, moved].any()
     # hindsight moves the target by a later finger-to-target of the episode, fresh ones are near 0
     back = walk[starts, 3] - obs[0, 3]
-    hindsight = np.isclose(back[:, None], walk[:, 3], atol=1e-4).any(1)
+    reached = np.isclose(back[:, None], walk[:, 3], atol=1e-4)
+    hindsight = reached.any(1)
+    assert (reached.argmax(1) >= starts)[moved & hindsight].all()
     finger = train_expert.REACHER_LINK * np.cos(np.cumsum(obs[0, :3], 0)).sum(0)
     fresh = moved & (np.abs(finger + obs[0, 3]) <= 0.2 + 1e-4)
     assert 0.42 < (moved & hindsight).mean() < 0.58 and 0.17 < fresh.mean() < 0.33
@@ -216,6 +219,68 @@ def test_a_share_of_an_online_student_s_states_is_its_own(monkeypatch):
     assert (obs == 1).all() and actions.shape == (4, 3, 16, 50) and (actions == 1).all()
     assert (mixed[:, :4] == 2).all() and (mixed[:, 4:] == 1).all() and (both[:, :, 4:] == 1).all()
     assert set(np.unique(both[:, :, :4])) == {0, 2} and abs(both[:, :, :4].mean() - 1) < 0.3
+
+
+def test_an_online_student_s_own_actions_begin_where_their_state_is(monkeypatch):
+    sizes, seen, real = fac.ModelConfig(8, 3, 1, 4, 6, 6), [], fac.perturbed_batch
+    expert = fac.WorldModel.create(sizes, np.random.default_rng(0), policy=True)
+    own = train_expert.ReplayBuffer(8, 3, fac.EPISODE_STEPS)
+    own.add(*ramp(), np.zeros(fac.EPISODE_STEPS))
+    config = fac.DistillConfig(batch_size=16, noise_samples=50, own_share=1.0, own_episodes=0)
+    monkeypatch.setattr(fac, "perturbed_batch", lambda *args: seen.append(args[2:4]) or real(*args))
+    train_expert.OnlineStudent(expert, 3, config, 0, own).update(
+        expert, np.ones((8, 16), np.float32), np.ones((4, 3, 16), np.float32))
+    ((obs, actions),) = seen
+    played = (actions[:, 0] == ((obs[0] + np.arange(4)[:, None]) / 512)[..., None]).all(0)
+    assert 0.4 < played.mean() < 0.6
+
+
+def training(*more):
+    """A Training that has done nothing yet."""
+    args = train_expert.make_parser().parse_args([*TINY, *more])
+    return train_expert.Training(args, *train_expert.read_settings(args))
+
+
+def test_exploration_falls_and_no_episode_is_played_twice():
+    found, seeds = training("--std-steps", "2000"), []
+    for decisions, std, horizon in ((0, 0.5, 1), (1000, 0.275, 2), (2000, 0.05, 3),
+                                    (3000, 0.05, 3)):
+        found.decisions = decisions
+        assert found.scheduled() == {"exploration_std": pytest.approx(std), "horizon": horizon}
+        if decisions:
+            planning = found.explorers()["explorer"][1]
+            assert (planning.min_std, planning.horizon) == (pytest.approx(std), horizon)
+        seeds += [seed for seed, *_ in found.explorations()]
+    assert len(set(seeds)) == len(seeds) == 2 + 3 * 4
+
+
+def test_every_update_has_states_and_perturbations_of_its_own(monkeypatch):
+    found, noise, states, real = training(), [], [], fac.perturbed_batch
+    found.buffer.add(*episode(np.random.default_rng(0), 1))
+    sample = found.buffer.sample
+    found.buffer.sample = lambda *args: states.append(sample(*args)) or states[-1]
+
+    def perturbed(expert, student, obs, actions, *rest):
+        noise.append(real(expert, student, obs, 0 * actions, *rest)[1])
+        return real(expert, student, obs, actions, *rest)
+
+    monkeypatch.setattr(fac, "perturbed_batch", perturbed)
+    for _ in range(2):
+        found.learn()
+    assert not np.array_equal(states[0][3][1], states[1][3][1])
+    assert not np.array_equal(*noise)
+
+
+def test_evaluations_and_their_ratio_are_of_whom_they_name(monkeypatch, tmp_path):
+    found = training("--episodes", "1")
+    found.curve = [{"decisions": 500}]
+    found.note([(1, "expert"), (2, "student")], [(np.float32([3, 4]),), (np.float32([1, 1]),)])
+    assert found.curve == [{"decisions": 500, "eval_expert": 7, "eval_student": 2}]
+    found.buffer.add(*episode(np.random.default_rng(0), 1))
+    monkeypatch.setattr(fac, "evaluate", lambda *_, label: {
+        "returns": [4.0 if label.endswith("student") else 8.0], "plan_ms_median": 1.0})
+    monkeypatch.setattr(train_expert, "draw", lambda *_: True)
+    assert train_expert.export(found, tmp_path, {"updates": 0})["ratio"] == 0.5
 
 
 def test_the_number_of_workers_changes_nothing(trained, tmp_path):
