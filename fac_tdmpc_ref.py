@@ -1770,7 +1770,8 @@ def distil_and_save(distiller, args, planning, header, out):
     if (path := out / "student.npz").exists():  # a run that this one would replace
         before, _ = read_npz(path, ("student",))
         same_settings({key: before.get(key) for key in settings}, settings, path)
-    elif not (out / "checkpoint.npz").exists() and (path := next(out.glob("*.json"), None)):
+    elif not (out / "checkpoint.npz").exists() and (path := next(out.glob("[cr]*.json"), None)):
+        # config.json or result.json
         raise UserError(f"{path}: not this run's, which would replace it; choose another --out")
     print(f"{args.task}: {student.config.num_agents} agents, {len(distiller.optimizer.vector):,} "
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
