@@ -194,10 +194,10 @@ def run_all(args, function, runs):
     if args.command in REPORTS:
         one_figure(path, [*(key for key in done if key[0] in args.tasks),
                           *(tuple(run.values()) for run in todo)], VARIED.get(args.command, ()))
-    append_rows(path, [])  # what can't be written is missed now
     address = getattr(args, "scheduler", None)
     ended = (on_cluster(function, todo, connect(address)) if address else
              in_processes(function, todo, max(1, min(args.jobs, len(todo)))))
+    append_rows(path, [])  # what can't be written is missed now
     with fac.progress(args.command, len(runs), "run", len(runs) - len(todo)) as bar:
         for rows in ended:
             append_rows(path, rows)

@@ -298,7 +298,9 @@ def test_dask_gives_the_rows_that_processes_give(tmp_path, monkeypatch):
 def test_bad_runs_are_refused(tmp_path, flags, parts):
     pytest.importorskip("joblib")
     pytest.importorskip("matplotlib")
+    before = sorted(experiments.RESULTS.iterdir())
     refused(run(*flags, cwd=tmp_path), *parts)
+    assert sorted(experiments.RESULTS.iterdir()) == before  # the default --out
 
 
 @pytest.mark.parametrize("figure", ["figure7", "figure8", "figure12"])
