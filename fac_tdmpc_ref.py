@@ -1296,9 +1296,10 @@ def lookup_task(task):
     return *task.split("-"), *TASKS[task]
 
 
-def episode_seeds(seed, episodes):
-    """Seeds of an evaluation's episodes: independent streams, the first n the same for all n."""
-    return [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(seed).spawn(episodes)]
+def episode_seeds(seed, episodes, first=0):
+    """Seeds of an evaluation's episodes from `first` on: independent, whatever their number."""
+    streams = np.random.SeedSequence(seed, n_children_spawned=first).spawn(episodes)
+    return [int(s.generate_state(1)[0]) for s in streams]
 
 
 def training_seeds(seed, use, first, count):
@@ -1686,10 +1687,9 @@ def draw_curve(path, curve, title):
         return False
     columns = dict(zip(CURVE, np.array(curve).T))
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-    for ax, lines in zip(axes, (
-            {"kl_reward": "rewards", "kl_value": "values"},
-            {"rank_correlation_h0": "Q, h = 0", "rank_correlation_last": "Q, h = H",
-             "rank_correlation_return": "return G"})):
+    for ax, lines in zip(axes, ({"kl_reward": "rewards", "kl_value": "values"}, {
+            "rank_correlation_h0": "Q, h = 0", "rank_correlation_last": "Q, h = H",
+            "rank_correlation_return": "return G"})):
         for key, label in lines.items():
             ax.plot(columns["step"], columns[key], label=label)
         ax.set(xlabel="gradient step")

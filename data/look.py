@@ -102,8 +102,7 @@ def command_watch(args):
         fac.check_task(models[1][1].config, task, args.beside)
     choose_renderer()
     environment = fac.Environment(task)
-    seed = np.random.SeedSequence(args.seed, spawn_key=(args.episode,))  # `fac.episode_seeds`'
-    seed = int(seed.generate_state(1)[0])
+    (seed,) = fac.episode_seeds(args.seed, 1, first=args.episode)
     episodes = [watch_episode(*found, environment, seed, args.decisions, args.every)
                 for found in models]
     images = draw_frames(episodes)
