@@ -51,9 +51,14 @@ def make_run(task, seed, case, **settings):
             "settings": json.dumps(settings, sort_keys=True)}
 
 
+def key_of(row):
+    """What a run, or any of its rows, is known by."""
+    return tuple(row[k] for k in KEY)
+
+
 def unique(runs):
     """Each run once, in their order: a task, a seed or a value may be named twice."""
-    return list({tuple(run.values()): run for run in runs}.values())
+    return list({key_of(run): run for run in runs}.values())
 
 
 def read_rows(path):
@@ -103,7 +108,7 @@ def finished(rows):
     """Rows of runs that came to their end, by run: {(task, seed, case, settings): rows}."""
     runs = {}
     for row in rows:
-        runs.setdefault(tuple(row[k] for k in KEY), []).append(row)
+        runs.setdefault(key_of(row), []).append(row)
     return {key: found for key, found in runs.items() if any(row["minutes"] for row in found)}
 
 
@@ -138,14 +143,14 @@ def in_processes(function, runs, jobs):
     """Rows of each run as it ends, in so many processes here. One that dies takes the others with
     it: runs that were begun are made again, each alone, which shows the one at fault."""
     import joblib
-    todo = {tuple(run.values()): run for run in runs}
+    todo = {key_of(run): run for run in runs}
     while todo:
         begun, parallel = {}, joblib.Parallel(  # a kill leaves no queue behind
             jobs, return_as="generator_unordered", batch_size=1, pre_dispatch="n_jobs")
         try:
             for rows in parallel(joblib.delayed(attempt)(function, begun.setdefault(*item),
                                                          os.getpid()) for item in [*todo.items()]):
-                del todo[tuple(rows[0][k] for k in KEY)]
+                del todo[key_of(rows[0])]
                 yield rows
         except BrokenExecutor as error:
             suspects = [todo.pop(key) for key in [*begun] if key in todo]
@@ -190,10 +195,10 @@ def run_all(args, function, runs):
         fac.lookup_task(task)
     path, errors = Path(args.out or RESULTS / f"{args.command}.csv"), []
     done, runs = finished(read_rows(path)), unique(runs)
-    todo = [run for run in runs if tuple(run.values()) not in done]
+    todo = [run for run in runs if key_of(run) not in done]
     if args.command in REPORTS:
-        one_figure(path, [*(key for key in done if key[0] in args.tasks),
-                          *(tuple(run.values()) for run in todo)], VARIED.get(args.command, ()))
+        one_figure(path, [*(key for key in done if key[0] in args.tasks), *map(key_of, todo)],
+                   VARIED.get(args.command, ()))
     address = getattr(args, "scheduler", None)
     ended = (on_cluster(function, todo, connect(address)) if address else
              in_processes(function, todo, max(1, min(args.jobs, len(todo)))))
@@ -432,10 +437,10 @@ def command_figure7(args):
 
 def time_all(args, result, runs, opened):
     """Add rows with milliseconds of the runs that have none. opened(run): (model, header)."""
-    timed = {tuple(row[k] for k in KEY) for row in read_rows(result["out"]) if row["ms"]}
+    timed = {key_of(row) for row in read_rows(result["out"]) if row["ms"]}
     groups = {}  # of one budget, which take turns
     for run in unique(runs):
-        if tuple(run.values()) not in timed:
+        if key_of(run) not in timed:
             about = json.loads(run["settings"])
             groups.setdefault((run["task"], about.get("samples"), about.get("iterations")),
                               []).append(run)
@@ -524,8 +529,6 @@ AUTHORS = {
     "humanoid-walk": (789, 724, 458, 227)}
 CASES = [*FIGURE4, *FIGURE5_CASES]
 BUDGET = ("data", "steps", "evaluations", "episodes", "samples", "iterations", "decisions")
-
-
 VARIED = {"figure7": ("samples", "iterations"), "figure8": ("joint", "kind")}
 
 
@@ -551,10 +554,9 @@ def settled(path, varied=()):
     for task, budget in one_figure(path, rows, varied).items():
         if budget["data"] != made_from(task, budget):
             print(f"{path}: {task} was made with other data or defaults than now", file=sys.stderr)
-    whole = {}  # by task and case: how many runs its seeds have at most
-    for (task, _, case), count in (have := Counter(key[:3] for key in rows)).items():
-        whole[task, case] = max(count, whole.get((task, case), 0))
-    parts = [key for key, count in have.items() if varied and count < whole[key[0], key[2]]]
+    have = Counter(key[:3] for key in rows)
+    parts = [(task, seed, case) for (task, seed, case), count in have.items() if count < max(
+        other for (t, _, c), other in have.items() if (t, c) == (task, case))]
     for task, seed, case in parts:
         print(f"{path}: {case} of {task}, seed {seed}, isn't whole: left out", file=sys.stderr)
     return {key: own for key, own in rows.items() if key[:3] not in parts}
@@ -748,6 +750,7 @@ def report_figure8(_, path, figures):
                                 figsize=(11, 2.8 * len(cells)), sharey="row")
     result, table = {}, []
     for row, (task, cases) in zip(grid, cells.items()):
+        actions = fac.lookup_task(task)[3]
         for ax, kind in zip(row, kinds):
             for i, (case, values) in enumerate(sorted(cases.items())):
                 joints = sorted(j for k, j in values if k == kind)
@@ -758,7 +761,7 @@ def report_figure8(_, path, figures):
                     ax.axhline(np.mean(values["none", 0]), color=f"C{i}", linestyle=("-", "--")[i])
             what = "one action is noise" if kind == "noise" else f"one motor x {kind}"
             ax.set(title=f"{task}: {what}", xlabel="action dimension", ylabel="episode return",
-                   xticks=range(0, 1 + max(j for _, j in values), 1 + len(values) // 40))
+                   xticks=range(0, actions, 1 + actions // 20))
         both = set.intersection(*(set(values) for values in cases.values()))  # measured for all
         result[task] = {case: {kind: float(np.mean([np.mean(values[k, j]) for k, j in both
                                                     if k == kind]))

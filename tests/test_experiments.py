@@ -274,8 +274,7 @@ def test_dask_gives_the_rows_that_processes_give(tmp_path, monkeypatch):
                       "--json", cwd=tmp_path))
         cluster.scheduler.allowed_failures = 0
         function, runs = seven_but_one_dies()
-        ((row,),) = experiments.on_cluster(function, runs[1:2],
-                                               experiments.connect(address))
+        ((row,),) = experiments.on_cluster(function, runs[1:2], experiments.connect(address))
     assert row["seed"] == "1" and row["error"].startswith("KilledWorker")
     assert rows_of(tmp_path / "dask.csv") == here and len(here) == 2
 
