@@ -17,8 +17,8 @@ the case N = 1. There is one world model, one planner, one loss. The axes, every
     d   action dimensions of an agent: dim(A) / N
     O   observation features;   A = N * d   action dimensions
     B   batch;   S   action sequences (the last axis);   M   rows of a replay
-    K   noise samples of the distillation loss (behind B): actions are (L, A, B, K) there
-    H   horizon: H rewards, then Q;   L   actions of a sequence: H + 1 in Equations 2 and 4
+    K   noise samples of the distillation loss; its actions are (L, A, B, K), a plan's (N, L, d, S)
+    H   horizon: a return G is H rewards, then Q;   L   actions of a sequence: H + 1 (Eq. 2 and 4)
     F   features an encoder reads;   P   proposals;   E   elites, or episodes;   T   decisions
 
 A layer is W (N, out, in), b (N, out, 1) and computes W @ x + b on x (N, in, B): samples last, so
@@ -126,8 +126,8 @@ class ModelConfig(Settings):
     latent_dim: int = field(50, "m: latent features of an agent (Table 2)", least=1)
     enc_dim: int = field(256, "hidden width of the encoder (Table 2)", least=1)
     mlp_dim: int = field(512, "hidden width of an agent's other networks (Table 2)", least=1)
-    expert_latent_dim: int = field(0, "width of the expert's latent, if the encoder reads it, not "
-                                   "the observation", least=0)
+    expert_latent_dim: int = field(0, "width of the expert's latent that the encoder reads; 0: it "
+                                   "reads the observation", least=0)
     expert_enc_dim: int = field(256, "hidden width of the frozen expert encoder below it", least=1)
 
     def __post_init__(self):
@@ -149,9 +149,9 @@ class PlannerConfig(Settings):
     iterations: int = field(4, "refinements of the Gaussian in a decision [D5]", paper=6, least=1)
     elites: int = field(0, "best ones, which refine it; 0: samples / 8 (Table 2: 64)", least=0)
     pi_trajs: int = field(24, "policy proposals, where there is a policy (Table 2)", least=0)
-    horizon: int = field(3, "H of Equation 2, unless the model's file names its own (Table 2)",
+    horizon: int = field(3, "H of Equation 2 (Table 2); commands take the model file's own",
                          least=0, most=EPISODE_STEPS - 1)
-    discount: float = field(0.99, "gamma, unless the model's file names its own (Table 2)",
+    discount: float = field(0.99, "gamma (Table 2); commands take the model file's own",
                             least=0, most=1)
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)", above=0)
     max_std: float = field(2.0, "first and largest sampling deviation (Table 2)", above=0)
@@ -468,7 +468,7 @@ class WorldModel:
         return tuple(forward(QNET, self.params, name, x)[:, 0] for name in ("_Q1", "_Q2"))
 
     def policy(self, z):
-        """The expert's policy mean, z (1, m, B) -> (1, A, B) in (-1, 1)."""
+        """The expert's policy mean, z (1, m, B) -> (1, A, B) in [-1, 1]."""
         return np.tanh(forward(MLP, self.params, "_pi", z))
 
     @property
@@ -486,8 +486,8 @@ class WorldModel:
 
 
 def policy_rollout(model, z, noise):
-    """Actions (L, N, d, B) of a model's policy, each with its noise (L of them), from latents z
-    (N, m, B) on, which its own dynamics roll out."""
+    """Roll a policy out in its own model from z (N, m, B): actions (L, N, d, B), each the policy's
+    plus its entry of `noise` (L of them), clipped to [-1, 1]."""
     actions = []
     for eps in noise:
         z = model.next(z, actions[-1]) if actions else z
@@ -527,9 +527,9 @@ def unroll(model, z, actions, transitions, tapes=None):
     """Roll a model's latent out under given actions, every column on its own trajectory.
 
     z (N, m, B), actions (L, A, B, K): K perturbed copies of a trajectory. Returns the networks'
-    input x (N, m + d, L * B * K), columns in the order (L, B, K), with s_{h+1} = f_T(s_h, a_h),
-    and the latents (N, m, B * K) after the last of `transitions`, if any: L - 1 for Equation 4, L
-    for Equation 1. tapes: for `predict_backward`, a list for each network and transition."""
+    input x (N, m + d, L * B * K), columns in the order (L, B, K), with s_{h+1} = f_T(s_h, a_h), and
+    the last latents that `transitions` reach (N, m, B * K), or None: L - 1 for Equation 4, where no
+    output reads s_L, L for Equation 1. tapes (`predict_backward`): one a head, one for each h."""
     L, _, B, K = actions.shape
     n, m, d = model.config.num_agents, model.config.latent_dim, model.config.agent_actions
     columns = B * K
@@ -561,7 +561,7 @@ def run_heads(model, x, actions, tapes=None):
 def predict_backward(model, tapes, d_outputs, grads, d_latents=None):
     """Walk `unroll` and `run_heads` back; adds to `grads`, returns dz (N, m, B).
 
-    d_outputs: gradients of the three outputs; d_latents (L, N, m, B * K): of s_1, ..., s_L."""
+    d_outputs: gradients of the outputs; d_latents (L, N, m, B * K), Equation 1's: of s_1 .. s_L."""
     n, m = model.config.num_agents, model.config.latent_dim
     (L, B, K), dx = d_outputs[0].shape, 0
     columns = B * K
@@ -604,13 +604,13 @@ def soft_kl(student, expert, temperature_student, temperature_expert, kind="forw
 
 
 def distill_loss(student, features, actions, targets, config, grads=None, divergence=soft_kl):
-    """Line 6 of Algorithm 1, with Table 2's coefficients, for both Q; adds gradients to `grads`.
+    """Line 6 of Algorithm 1, with Table 2's coefficients c, for both Q; adds gradients to `grads`.
 
         mean over B of sum_h lambda^h [c_R D(R_h) + c_Q (D(Q1_h) + D(Q2_h))]
 
     features (1, F, B): what the student's encoder reads in the first states; actions
     (L, A, B, K): perturbed; targets: the expert's `predict` for them. Returns the loss and
-    the mean divergences of reward and value over steps and states. divergence: as `soft_kl`."""
+    the mean divergences of reward and value over steps and states. divergence: D, as `soft_kl`."""
     tapes, encoder_tape = defaultdict(list), []
     z = student.encode_features(features, encoder_tape)
     outputs = predict(student, z, actions, tapes)
@@ -662,8 +662,8 @@ def perturbed_batch(expert, student, obs, actions, config, rng):
 
 
 def own_actions(expert, obs, played, copies, rng):
-    """Actions (L, A, B, K) to perturb in the student's own states obs (O, B) [D8]: for each copy of
-    each, by a coin, what the expert's policy would do or what the student `played` (L, A, B)."""
+    """Actions (L, A, B, K) to perturb in the student's own states obs (O, B) [D8]: a coin for each
+    copy picks the expert policy's, rolled out from obs, or what the student `played` (L, A, B)."""
     pi = policy_rollout(expert, expert.encode(obs), [F32(0)] * len(played))[:, 0]
     return np.where(rng.random((len(obs.T), copies)) < 0.5, pi[..., None], played[..., None])
 
@@ -676,7 +676,7 @@ class Distiller:
     """Algorithm 1: one `step` after the other, reproducible from the seed, and from `state`.
 
     The expert is frozen: what it predicts for a pool of states and their perturbed actions is
-    computed once and learned from `reuse` times, by two threads, as NumPy frees the interpreter.
+    computed once and learned from `reuse` times; by two threads: NumPy's products hold no GIL.
     sizes: replace `student_config`'s. UserError if expert, replay and config don't fit."""
 
     loss, perturb = staticmethod(distill_loss), staticmethod(perturbed_batch)  # or a subclass's own
@@ -852,7 +852,7 @@ def mppi(returns, mean, config, rngs, proposals=None):
     one Generator for each agent; proposals (N, L, d, P): sequences that compete in every iteration.
     Elites are chosen agent by agent (Equation 3): G is a sum of G_i(a_i), so the best of each is
     the best of all (Proposition 1). N = 1 is centralized MPPI. Returns the new mean (N, L, d), the
-    last elites (N, L, d, E), their scores (N, E), which sum to 1. UserError if no G is finite."""
+    last elites (N, L, d, E), scores (N, E) of sum 1 each. UserError: an agent has no finite G."""
     mean, std = mean[..., None], F32(config.max_std)
     if proposals is not None:
         G_proposals = returns(proposals)
@@ -898,8 +898,8 @@ def policy_noise(shape, rng):
 
 
 class AgentPlanner:
-    """Plans for all, some or one of a model's agents. rows, swap: for `Returns`, where another
-    process shares one."""
+    """Plans for all, some or one of a model's agents. rows, swap: `Returns`'s, where two processes
+    share an agent."""
 
     def __init__(self, model, config, rows=None, swap=None):
         self.model, self.config = model, config
@@ -914,7 +914,7 @@ class AgentPlanner:
             self.rngs = [np.random.Generator(np.random.SFC64(s)) for s in seeds]
 
     def plan(self, z):
-        """z (N, m, 1) -> the agents' first actions (N, d); keeps the warm start."""
+        """z (N, m, 1) -> first actions (N, d). The mean, moved on by one, starts the next plan."""
         config = self.config
         returns = (self.fast.start(z, config) if self.fast else
                    functools.partial(h_step_return, self.model, z, config=config))
@@ -983,7 +983,7 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
         return action.reshape(-1)
 
     def _add_up(self, G):
-        """Add up all processes' returns (N, S), zero where one rolled nothing out, for each."""
+        """Returns (N, S) of all processes, summed (0: not rolled out there), and sent to each."""
         total = np.zeros((self.model.config.num_agents, G.shape[1]), F32)
         for part, found in zip(self._parts, [G, *self._workers.receive_all()]):
             total[part] += found
@@ -992,7 +992,7 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
 
 
 # ---- The same, fast: a first reading skips this. `Returns` computes h_step_return.
-np.empty(1 << 22, F32)  # freed at once; glibc keeps what is smaller: faults took 0.4 of a plan
+np.empty(1 << 22, F32)  # once freed, glibc keeps smaller arrays: page faults took 0.4 of a plan
 
 
 def homogeneous(params, layer):
@@ -1158,7 +1158,7 @@ class Workers(contextlib.AbstractContextManager):
 
     Spawned, since fork is unsafe once BLAS has threads; with one BLAS thread each; deaf to
     Ctrl-C, which ends the parent, whose closed pipes end them. What they work on is sent through
-    the connection: a process that dies at its start would block a parent that passes it."""
+    the connection: as an argument it would block the parent of a child that dies at its start."""
 
     def __init__(self, target, count, name="worker"):
         context, self._name, self._members = multiprocessing.get_context("spawn"), name, []
@@ -1417,7 +1417,7 @@ def made_for(header, where):
 
 
 class Replay:
-    """The dataset of Algorithm 1: transitions in order, episode after episode.
+    """The dataset of Algorithm 1 [D6]: transitions in order, episode after episode.
 
     observation (M, O) and action (M, A) float16, continues (M,): False in an episode's last
     row, whose action stands for nothing. Raises UserError for anything else."""

@@ -102,8 +102,8 @@ def _angle_between(a, b, c):
 
 
 def actuate(theta, action, low, span):
-    """f_a: an action in [-1, 1] commands an angle in [low, low + span], and the joint turns
-    towards it by MAX_TURN at most. Shapes broadcast."""
+    """f_a: an action in [-1, 1], in the paper a force, commands an angle in [low, low + span]; the
+    joint turns towards it by MAX_TURN at most (authors' notebook). Shapes broadcast."""
     turn = low + (action + 1) * (span / 2) - theta
     return theta + np.minimum(np.maximum(turn, -MAX_TURN), MAX_TURN)
 
@@ -175,7 +175,7 @@ def imagined_return(model, state, actions, discount):
 
 
 class Run:
-    """A model's planner on its way with the arm: angles (steps + 1 of (3,)), times, actions."""
+    """A planner that moves the arm: its angles (steps + 1 of (3,)), seconds a plan, actions."""
 
     def __init__(self, label, model, config, seed, theta=START_ANGLES):
         self.label, self.model, self.config = label, model, config
