@@ -79,10 +79,10 @@ START_ANGLES, GOAL_ANGLES = inverse_kinematics(np.stack([START, GOAL], axis=1)).
 def closed_form_kinematics(xy):
     """The same map without iterations: tip (..., 2, S) -> angles (..., 3, S).
 
-    Three joints reach a point in infinitely many ways; this is, of the two with theta_3 nearest to
-    IK_START's, the one of positive bend (theta_2 itself may be negative). With that wrist links 2
-    and 3 are one straight link of length r, and a two-link arm has a textbook solution. r is
-    clipped so that every reachable point is solved.
+    Three joints reach a point in infinitely many ways; this is, of the two with theta_3 (the wrist)
+    nearest to IK_START's, the one of positive bend (theta_2 itself may be negative). With that
+    wrist links 2 and 3 are one straight link of length r, which makes the angle `bend` with link 1,
+    and a two-link arm has a textbook solution. r is clipped: every reachable point is solved.
     """
     one, two, three = LINKS
     x, y = xy[..., 0, :], xy[..., 1, :]
