@@ -149,7 +149,7 @@ class PlannerConfig(Settings):
     iterations: int = field(4, "refinements of the Gaussian in a decision [D5]", paper=6, least=1)
     elites: int = field(0, "best ones, which refine it; 0: samples / 8 (Table 2: 64)", least=0)
     pi_trajs: int = field(24, "policy proposals, where there is a policy (Table 2)", least=0)
-    horizon: int = field(3, "H of Equation 2 (Table 2); commands take the model file's own",
+    horizon: int = field(3, "H of Equation 2 (Table 2); `evaluate` takes the model file's own",
                          least=0, most=EPISODE_STEPS - 1)
     discount: float = field(0.99, "gamma (Table 2); commands take the model file's own",
                             least=0, most=1)
@@ -425,7 +425,7 @@ class WorldModel:
 
     `params` maps official TD-MPC state-dict names to arrays with a leading agent axis, all of
     one dtype (float32; float64 only to check gradients). The encoder is centralized (N = 1); only
-    experts have a policy, `_pi`, and only students an expert's frozen encoder below their own."""
+    experts have TD-MPC's policy, `_pi` (a of high Q); only students an expert's frozen encoder."""
 
     def __init__(self, config, params):
         self.config, self.params = config, params
@@ -463,7 +463,7 @@ class WorldModel:
         return forward(MLP, self.params, "_reward", np.concatenate([z, a], 1))[:, 0]
 
     def q(self, z, a):
-        """Both values q^i = f_Q^i(s^i, a^i) -> two (N, B); the global ones are the sums."""
+        """Both q^i = f_Q^i(s^i, a^i) (Table 2: num_q 2) -> two (N, B); the sums are global."""
         x = np.concatenate([z, a], 1)
         return tuple(forward(QNET, self.params, name, x)[:, 0] for name in ("_Q1", "_Q2"))
 
@@ -528,8 +528,8 @@ def unroll(model, z, actions, transitions, tapes=None):
 
     z (N, m, B), actions (L, A, B, K): K perturbed copies of a trajectory. Returns the networks'
     input x (N, m + d, L * B * K), columns in the order (L, B, K), with s_{h+1} = f_T(s_h, a_h), and
-    the last latents that `transitions` reach (N, m, B * K), or None: L - 1 for Equation 4, where no
-    output reads s_L, L for Equation 1. tapes (`predict_backward`): one a head, one for each h."""
+    the latents after the last transition (N, m, B * K), if any: for Equation 4 L - 1 transitions
+    suffice, for Equation 1 it takes L. tapes (`predict_backward`): one a head, one for each h."""
     L, _, B, K = actions.shape
     n, m, d = model.config.num_agents, model.config.latent_dim, model.config.agent_actions
     columns = B * K
@@ -590,7 +590,7 @@ def log_softmax(x):
 def soft_kl(student, expert, temperature_student, temperature_expert, kind="forward"):
     """D(p_e || p_s) of p_e = softmax(expert / T_e) and p_s = softmax(student / T_s), Equation 4.
 
-    student, expert (..., K): predictions for K perturbed copies of a state's actions. "reverse"
+    student, expert (..., K): predictions at h for K copies, each in its own s_h. "reverse"
     is D(p_s || p_e) [D2]. Returns the divergence (...) and its gradient by `student` (..., K)."""
     log_s = log_softmax(student / temperature_student)
     log_e = log_softmax(expert / temperature_expert)
@@ -652,7 +652,7 @@ def learning_rate(config, t):
 def perturbed_batch(expert, student, obs, actions, config, rng):
     """Features (1, F, B), perturbed actions (L, A, B, K) and the expert's predictions for them.
 
-    obs (O, B); actions a_h (L, A, B, K), or (L, A, B, 1): a_h + eps_h may be clipped [D7]."""
+    obs (O, B); a_h (L, A, B, 1), or one a copy (L, A, B, K): a_h + eps_h may be clipped [D7]."""
     noise = rng.standard_normal((*actions.shape[:3], config.noise_samples), F32)
     limit = 1 if config.clip_actions else np.inf
     perturbed = np.clip(actions + F32(config.noise_std) * noise, -limit, limit)
@@ -704,7 +704,7 @@ class Distiller:
                         for _ in range(2)]  # each thread's gradient: a vector, its parts by name
 
     def draw(self, number, part, size):
-        """Lines 4 and 6 (expert) for `size` states, a pool's part: as `perturb` returns."""
+        """Lines 4 and 6 (expert), `size` states, part `part` of a pool; as `perturb` returns."""
         rng, L = stream(self.seed, f"pool {number}", part), self.config.horizon + 1
         K, dim_obs = self.config.noise_samples, self.replay.dim_obs
         obs, actions = self.replay.sequences(rng.choice(self.train_starts, size), L)
@@ -834,7 +834,7 @@ def h_step_return(model, z, actions, config):
 
         G = sum_{h=0}^{H-1} gamma^h r(s_h, a_h) + gamma^H Q(s_H, a_H),   s_{h+1} = f_T(s_h, a_h)
 
-    z (N, m, 1), actions (N, H + 1, d, S) -> G (N, S). Q is the mean of the two: unlike TD-MPC's
+    z (N, m, 1), actions (N, H + 1, d, S) -> G_i (N, S). Q is the mean of the two: unlike TD-MPC's
     minimum, a mean of sums is the sum of means, as Proposition 1 needs [D4]."""
     gamma, G = config.discount, 0.0
     z = np.repeat(z, actions.shape[-1], axis=2)
@@ -848,9 +848,9 @@ def h_step_return(model, z, actions, config):
 def mppi(returns, mean, config, rngs, proposals=None):
     """MPPI: refine a Gaussian over action sequences by its elites, for each agent alone.
 
-    returns: actions (N, L, d, S) -> G (N, S); mean (N, L, d): the first Gaussian's; rngs:
+    returns: actions (N, L, d, S) -> every G_i (N, S); mean (N, L, d): the first Gaussian's; rngs:
     one Generator for each agent; proposals (N, L, d, P): sequences that compete in every iteration.
-    Elites are chosen agent by agent (Equation 3): G is a sum of G_i(a_i), so the best of each is
+    Elites are chosen agent by agent (Equation 3): a plan's G is sum_i G_i(a_i): the best of each is
     the best of all (Proposition 1). N = 1 is centralized MPPI. Returns the new mean (N, L, d), the
     last elites (N, L, d, E), scores (N, E) of sum 1 each. UserError: an agent has no finite G."""
     mean, std = mean[..., None], F32(config.max_std)
@@ -907,7 +907,7 @@ class AgentPlanner:
         self.reset([])
 
     def reset(self, seeds):
-        """Forget the warm start; seeds: one SeedSequence for each agent, [] to keep streams."""
+        """Forget the last plan's mean; seeds: one SeedSequence an agent, [] to keep the streams."""
         sizes = self.model.config
         self.mean = np.zeros((sizes.num_agents, self.config.horizon + 1, sizes.agent_actions), F32)
         if len(seeds):
@@ -932,7 +932,7 @@ class AgentPlanner:
 
 
 class Planner(contextlib.ExitStack):  # whose `close` ends the workers
-    """Observation in, action out, with the warm start kept between decisions.
+    """Observation in, action out; an episode's next plan starts from the last one's mean.
 
         with Planner(model, PlannerConfig(), seed=0, workers=1) as planner:
             action = planner.act(obs)      # (O,) -> (A,) in [-1, 1]
@@ -957,7 +957,7 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
         self.reset(np.random.SeedSequence(seed).entropy)  # None: the system's own
 
     def reset(self, seed=None):
-        """Start an episode: forget the warm start; a seed also starts the random streams anew."""
+        """Start an episode: forget the last plan's mean; a seed also starts the streams anew."""
         n = self.model.config.num_agents
         seeds = [] if seed is None else np.random.SeedSequence(seed).spawn(n)
         self._workers.send_all(seeds[part] for part in self._parts[1:])
@@ -1111,7 +1111,7 @@ def sample_blocks(sizes, samples):
 
 def split_agents(agents, workers, blocks=1):
     """Two lists, an entry for this process and for each worker beside it: its agents, a slice; and
-    None or, for each block of samples, those that it rolls out. UserError for too many workers.
+    None or, by block of samples, which of these (from 0) it rolls out. UserError: too many workers.
 
     The latter where a cut of agents x blocks (512 samples are 2 or 4) falls inside an agent: of 3
     agents both processes plan agent 1; its first block is rolled out here, its second there."""
