@@ -1731,10 +1731,10 @@ def command_distill(args):
     planning = from_args(PlannerConfig, args, **{
         **preset(PlannerConfig), **made_for(header, path), "horizon": config.horizon})
     out = Path(args.out or f"runs/{args.task}-{args.seed}")
-    out.mkdir(parents=True, exist_ok=True)
     record = read_records(path).get(record_key(expert, planning, args.eval_seed), [])
     with contextlib.closing(Distiller(expert, replay, config, args.num_agents,
                                       args.seed)) as distiller:
+        out.mkdir(parents=True, exist_ok=True)
         result = distil_and_save(distiller, args, planning, header, out)
     obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
     result.update(evaluate_both(expert, record, distiller.student, args, planning))
@@ -1795,7 +1795,7 @@ def evaluate_both(expert, record, student, args, planning):
     recorded = len(record) >= args.episodes and not args.evaluate_expert
     experts = record[:args.episodes] if recorded else evaluate(
         expert, args.task, planning, *where, "evaluating the expert")["returns"]
-    return {"episodes": args.episodes, "expert_recorded": recorded,
+    return {"episodes": args.episodes, "eval_seed": args.eval_seed, "expert_recorded": recorded,
             "expert_return_mean": float(np.mean(experts)),
             "expert_return_std": float(np.std(experts)), "expert_returns": experts,
             "student_return_mean": float(np.mean(students)),
@@ -1916,7 +1916,7 @@ def natural(text, least=0):
 
 def add_command(commands, name, run, help, **extra):
     """A sub-command with --json, which every one has."""
-    sub = commands.add_parser(name, help=help, description=help, **extra)
+    sub = commands.add_parser(name, help=help, description=help, allow_abbrev=False, **extra)
     sub.set_defaults(run=run)
     sub.add_argument("--json", action="store_true",
                      help="print one JSON object as the last line of stdout")

@@ -392,7 +392,8 @@ def planner_config(args):
         fac.need(least <= getattr(args, name) <= 10**8,
                  f"--{name} must be in {least} to 10**8, not {getattr(args, name)}")
     if args.figure:
-        fac.need(args.figure.endswith(".png"), f"--figure {args.figure} should end in .png")
+        fac.need(args.figure.endswith(".png") and not fac.Path(args.figure).is_dir(),
+                 f"--figure {args.figure} should end in .png, and not be a folder")
         fac.check_writable(args.figure)  # UserError now rather than after the run
         fac.pyplot()
     return dataclasses.replace(TABLE_1, samples=args.samples, elites=min(5, args.samples),

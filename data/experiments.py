@@ -14,6 +14,7 @@ import contextlib
 import csv
 import ctypes
 import dataclasses
+import fcntl
 import functools
 import importlib.util
 import io
@@ -89,6 +90,7 @@ def append_rows(path, rows):
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(path, "a+b") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)  # of two commands one writes
             file.seek(0)
             before = file.read()
             if b"\n" not in before:
@@ -145,8 +147,8 @@ def in_processes(function, runs, jobs):
     import joblib
     todo = {key_of(run): run for run in runs}
     while todo:
-        begun, parallel = {}, joblib.Parallel(  # a kill leaves no queue behind
-            jobs, return_as="generator_unordered", batch_size=1, pre_dispatch="n_jobs")
+        begun, parallel = {}, joblib.Parallel(  # 1 would be this process; a kill leaves no queue
+            max(2, jobs), return_as="generator_unordered", batch_size=1, pre_dispatch=jobs)
         try:
             for rows in parallel(joblib.delayed(attempt)(function, begun.setdefault(*item),
                                                          os.getpid()) for item in [*todo.items()]):
@@ -552,8 +554,9 @@ def settled(path, varied=()):
     """A CSV's finished runs, of one figure; without seeds that lack some of what is varied."""
     rows = finished(read_rows(path))
     for task, budget in one_figure(path, rows, varied).items():
-        if budget["data"] != made_from(task, budget):
-            print(f"{path}: {task} was made with other data or defaults than now", file=sys.stderr)
+        with contextlib.suppress(fac.UserError):  # its data may not be here
+            if budget["data"] != made_from(task, budget):
+                print(f"{path}: {task} is of other data or defaults than now", file=sys.stderr)
     have = Counter(key[:3] for key in rows)
     parts = [(task, seed, case) for (task, seed, case), count in have.items() if count < max(
         other for (t, _, c), other in have.items() if (t, c) == (task, case))]
@@ -619,7 +622,9 @@ def draw_lines(path, panels, xlabel, **axes):
 def expert_level(task, rows):
     """The mean of an expert's recorded returns, planned as the runs were; None: no record."""
     about = next((json.loads(settings) for own, _, _, settings in rows if own == task), {})
-    expert, header = fac.load_model(path := fac.data_file(task, "expert.npz"))
+    if not (path := fac.DATA / task / "expert.npz").exists():
+        return None
+    expert, header = fac.load_model(path)
     returns = fac.read_records(path).get(fac.record_key(expert, planning_for(header, about), 0), [])
     return float(np.mean(returns[:about.get("episodes")])) if returns else None
 
@@ -799,9 +804,8 @@ def command_report(args):
         if finished(read_rows(results / f"{name}.csv")):
             try:
                 result[name], table = make(name, results / f"{name}.csv", figures)
-            except (LookupError, ValueError, TypeError, StopIteration) as error:
-                raise fac.UserError(f"{results / name}.csv: not {name}'s rows ({error!r})"
-                                    ) from None
+            except (LookupError, ValueError, TypeError, StopIteration) as odd:
+                raise fac.UserError(f"{results / name}.csv: not {name}'s rows ({odd!r})") from None
             title = name.replace("figure", "Figure ").capitalize()
             text.append(f"## {title}\n\n{table}\n![]({figures_from}/{name}.png)\n")
     fac.need(result, f"{results}: no runs there; make some, e.g. with 'experiments.py figure4'")
@@ -869,13 +873,12 @@ def make_parser():
                      help="of training, a multiple of 2000 [30000; walker-walk: 48000]")
     add_runs("figure13", command_figure13, "Appendix C.2: the number of agents.", walkers,
              **curve)
-    for name in ("figure7", "figure13"):
-        add = commands.choices[name].add_argument
-        add("--rounds", type=positive, default=20, help="timings of each [20]")
+    for sub in (commands.choices["figure7"], commands.choices["figure13"]):
+        sub.add_argument("--rounds", type=positive, default=20, help="timings of each [20]")
     sub = add_runs("sweep", command_sweep, "A grid over Algorithm 1's settings and num-agents.",
                    ["reacher-hard"], steps=fac.DistillConfig.steps, evaluations=1, episodes=10)
-    sub.add_argument("--set", nargs="+", required=True, metavar="SETTING=VALUE,...",
-                     help="e.g. lr=1e-3,3e-4 batch-size=16,32; see distill --help")
+    sub.add_argument("--set", nargs="+", action="extend", required=True, metavar="NAME=VALUE,...",
+                     help="e.g. lr=1e-3,3e-4 batch-size=16,32; Algorithm 1's in distill --help")
     sub.add_argument("--backend", choices=("loky", "dask"), default="loky", help="processes of "
                      "this machine, or a cluster whose scheduler and workers (--nthreads 1) have "
                      "this repository and its data/ on their PYTHONPATH [loky]")

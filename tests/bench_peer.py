@@ -8,6 +8,7 @@ the same turn, below 1 is faster. Sizes are section 5.1's (latent and hidden 512
 Table 2's (512 samples, 6 iterations, horizon 3).
 """
 import argparse
+import functools
 import contextlib
 import json
 import os
@@ -295,7 +296,8 @@ def training(threads, turns, batch=256):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--turns", type=int, default=9, help="of each comparison [9]")
+    parser.add_argument("--turns", type=functools.partial(fac.natural, least=1), default=9,
+                        help="of each comparison [9]")
     parser.add_argument("--json", action="store_true", help="print one JSON object as last line")
     args = parser.parse_args()
     result = {"central_ratio": None, "fac_ratio": {}, "jax_ratio": {}, "distill_ratio": {},

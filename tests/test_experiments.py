@@ -191,9 +191,10 @@ def seven_but_one_dies():
     return function, [experiments.make_run("cheetah-run", seed, "x") for seed in range(4)]
 
 
-def test_a_run_whose_process_dies_is_a_row_and_stops_nothing(capfd):
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_run_whose_process_dies_is_a_row_and_stops_nothing(jobs, capfd):
     pytest.importorskip("joblib")
-    found = list(experiments.in_processes(*seven_but_one_dies(), 2))
+    found = list(experiments.in_processes(*seven_but_one_dies(), jobs))
     rows = {row["seed"]: row for (row,) in found}
     assert len(found) == len(rows) == 4 and "SIGKILL" in rows["1"]["error"]
     assert all(rows[seed]["return_mean"] == 7 and rows[seed]["minutes"] >= 0 for seed in "023")
@@ -284,6 +285,8 @@ def test_dask_gives_the_rows_that_processes_give(tmp_path, monkeypatch):
     (["sweep", "--set", "depth=3"], ["depth=3", "noise_samples"]),
     (["sweep", "--set", "lr=fast"], ["lr=fast", "float"]),
     (["sweep", "--set", "lr=1e-3", "lr=1e-4"], ["lr", "twice"]),
+    (["sweep", "--set", "lr=1e-3", "--set", "lr=1e-4"], ["lr", "twice"]),
+    (["figure6", "--out", "x.csv"], ["unrecognized", "--out"]),
     (["sweep", "--set", "kl=sideways"], ["kl", "sideways"]),
     (["sweep", "--set", "num-agents=3,7"], ["num_agents", "[1, 3]", "not 7"]),
     (["sweep", "--set", "lr=1e-3", "--backend", "dask"], ["--scheduler"]),
@@ -675,7 +678,16 @@ def test_runs_of_other_settings_don_t_make_one_figure(tmp_path, capsys, case, se
     assert (f"TAP of walker-run, seed 0, was made with {first}, {case}, seed {seed}, with {second};"
             in str(caught.value))
     assert len(experiments.settled(path, ("joint", setting))) == 2
-    assert "walker-run was made with other data or defaults than now" in capsys.readouterr().err
+    assert "walker-run is of other data or defaults than now" in capsys.readouterr().err
+
+
+def test_a_report_needs_no_expert(tmp_path, monkeypatch):
+    rows = [{"step": 1, "return_mean": 7.0, "minutes": 1.0}]
+    write_rows(tmp_path / "figure4.csv", [("walker-run", 0, "TAP", {"data": [1]}, rows)])
+    monkeypatch.setattr(fac, "DATA", tmp_path)
+    monkeypatch.setattr(experiments, "draw_lines", lambda *_, **__: None)
+    result, table = experiments.report_curves("figure4", tmp_path / "figure4.csv", tmp_path)
+    assert result["walker-run"]["TAP"]["mean"] == 7 and "| walker-run | 7 | - |" in table
 
 
 def test_what_a_student_was_made_with_tells_it_apart():
