@@ -173,7 +173,7 @@ def configs_of(monkeypatch, *arguments):
     monkeypatch.setattr(fac, "from_args", watched)
     monkeypatch.setattr(fac, "load_data", lambda _: (None, {}, None, "x"))
     monkeypatch.setattr(fac, "load_model", lambda _: (None, {}))
-    for where, function in ((fac.Path, "mkdir"), (fac, "evaluate")):
+    for where, function in ((fac, "read_records"), (fac, "evaluate")):
         monkeypatch.setattr(where, function, stop)
     assert fac.main([str(a) for a in arguments]) == 2
     monkeypatch.undo()
