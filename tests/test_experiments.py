@@ -570,7 +570,8 @@ def test_figures_7_and_8_plan_with_both_models(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(experiments, "BUDGETS", [(8, 1), (4, 1)])
     fac.save_model("runs/reacher-hard-0/student.npz", random_model(), {"kind": "student"})
-    flags = ["--tasks", "reacher-hard", "--seeds", "0", "--jobs", "1", "--episodes", "1"]
+    flags = ["--tasks", "reacher-hard", "--seeds", "0", "--jobs", "1", "--episodes", "1",
+             "--students", str(tmp_path / "runs")]  # joblib's processes may be older than chdir
     for _ in range(2):  # nothing is missing the second time
         assert experiments.main(["figure7", *flags, "--rounds", "2", "--out", "7.csv"]) == 0
         rows = experiments.read_rows("7.csv")
