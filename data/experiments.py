@@ -203,7 +203,7 @@ def run_all(args, function, runs):
                    VARIED.get(args.command, ()))
     address = getattr(args, "scheduler", None)
     ended = (on_cluster(function, todo, connect(address)) if address else
-             in_processes(function, todo, max(1, min(args.jobs, len(todo)))))
+             in_processes(function, todo, min(args.jobs, len(todo))))
     append_rows(path, [])  # what can't be written is missed now
     with fac.progress(args.command, len(runs), "run", len(runs) - len(todo)) as bar:
         for rows in ended:

@@ -8,8 +8,8 @@ the same turn, below 1 is faster. Sizes are section 5.1's (latent and hidden 512
 Table 2's (512 samples, 6 iterations, horizon 3).
 """
 import argparse
-import functools
 import contextlib
+import functools
 import json
 import os
 import sys
