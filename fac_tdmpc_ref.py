@@ -898,12 +898,11 @@ def policy_noise(shape, rng):
 
 
 class AgentPlanner:
-    """Plans for all, some or one of a model's agents. rows, swap: `Returns`'s, where two processes
-    share an agent."""
+    """Plans for all, some or one of a model's agents."""
 
-    def __init__(self, model, config, rows=None, swap=None):
+    def __init__(self, model, config):
         self.model, self.config = model, config
-        self.fast = None if config.returns == "plain" else Returns(model, rows, swap)
+        self.fast = None if config.returns == "plain" else Returns(model)
         self.reset([])
 
     def reset(self, seeds):
@@ -944,12 +943,10 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
     weights are copied: make a new planner when they have changed."""
 
     def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
-        self.model, sizes = model, model.config
-        blocks = 1 if config.returns == "plain" else sample_blocks(sizes, config.samples)
-        self._parts, rows = split_agents(sizes.num_agents, workers, blocks)
-        own, *others = ((model.agents(part.start, part.stop), config, row)
-                        for part, row in zip(self._parts, rows))
-        self.own = AgentPlanner(*own, self._add_up)
+        self.model = model
+        self._parts = split_agents(model.config.num_agents, workers)
+        own, *others = ((model.agents(part.start, part.stop), config) for part in self._parts)
+        self.own = AgentPlanner(*own)
         super().__init__()
         self._workers = self.enter_context(Workers(_planning_worker, workers, "planning worker"))
         self._workers.send_all(others)
@@ -977,18 +974,7 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
             except BaseException:  # answers left unread would be the next decision's
                 self.close()
                 raise
-        action = np.empty((len(z), self.model.config.agent_actions), F32)
-        for part, plan in zip(self._parts, plans):  # both who share an agent plan it alike
-            action[part] = plan
-        return action.reshape(-1)
-
-    def _add_up(self, G):
-        """Returns (N, S) of all processes, summed (0: not rolled out there), and sent to each."""
-        total = np.zeros((self.model.config.num_agents, G.shape[1]), F32)
-        for part, found in zip(self._parts, [G, *self._workers.receive_all()]):
-            total[part] += found
-        self._workers.send_all(total[part] for part in self._parts[1:])
-        return total[self._parts[0]]
+        return np.concatenate(plans).reshape(-1)
 
 
 # ---- The same, fast: a first reading skips this. `Returns` computes h_step_return.
@@ -1014,14 +1000,10 @@ class Returns:
     Layers are homogeneous matrices: a bias costs no pass over the activations, and the row of
     ones goes through ELU unchanged. Networks with the same input share its first product
     (dynamics with reward; both Q). The latent's part of that product is computed once a plan, as
-    all samples start from one latent. LayerNorm's mean and gain are folded into the weights.
+    all samples start from one latent. LayerNorm's mean and gain are folded into the weights."""
 
-    rows: where another process plans the first or last agent, too. Both draw the same actions;
-    each rolls out, for block k, only the agents in the slice rows[k]; `swap` adds up returns."""
-
-    def __init__(self, model, rows=None, swap=None):
+    def __init__(self, model):
         self.sizes, p = model.config, model.params  # below, w is the hidden width
-        self.rows, self.swap = rows, swap
         step, both_q = ("_dynamics", "_reward"), ("_Q1", "_Q2")
         self.first = [side_by_side(p, step, 0), self._fold_norm(p)]     # (N, 2w + 2, m + d + 1)
         self.second = [[homogeneous(p, f"{name}.{i}") for name in pair]  # (N, w + 1, w + 1)
@@ -1061,43 +1043,39 @@ class Returns:
 
     def __call__(self, actions):
         """actions (N, L, d, S) -> G (N, S)."""
-        rows = self.rows or [slice(None)] * sample_blocks(self.sizes, actions.shape[-1])
-        G = np.zeros((len(actions), actions.shape[-1]), F32)
-        blocks = (np.array_split(x, len(rows), axis=-1) for x in (actions, G))
-        for agents, block, into in zip(rows, *blocks):
-            into[agents] = self._block(block[agents], agents)
-        return self.swap(G) if self.rows else G
+        blocks = np.array_split(actions, sample_blocks(self.sizes, actions.shape[-1]), axis=-1)
+        return np.concatenate([self._block(block) for block in blocks], 1)
 
-    def _block(self, actions, agents):
-        """Equation 2 for a block of samples of the agents in the slice `agents`."""
+    def _block(self, actions):
+        """Equation 2 for a block of samples."""
         m, half, G = self.sizes.latent_dim, self.sizes.mlp_dim + 1, F32(0)
         x = np.ones((len(actions), m + actions.shape[2] + 1, actions.shape[-1]), F32)  # (z, a, 1)
         for h in range(self.horizon + 1):
             x[:, m:-1] = actions[:, h]
             if h < self.horizon:
-                y = self._hidden(0, h, x, agents)
-                out = self.to_reward[agents] @ y[:, half:]
-                np.matmul(self.to_latent[agents], y[:, :half], out=x[:, :m])
+                y = self._hidden(0, h, x)
+                out = self.to_reward @ y[:, half:]
+                np.matmul(self.to_latent, y[:, :half], out=x[:, :m])
             else:
-                out = self.to_q[agents] @ self._hidden(1, h, x, agents)
+                out = self.to_q @ self._hidden(1, h, x)
             G = G + F32(self.discount ** h) * out[:, 0]
         return G
 
-    def _hidden(self, pair, h, x, agents):
+    def _hidden(self, pair, h, x):
         """Both hidden layers of a pair of networks (0: dynamics and reward, 1: the two Q)."""
-        y = (self.first[pair][agents] @ x if h else
-             self.first_at_start[pair][agents] @ x[:, self.sizes.latent_dim:])
-        y = self._norm_tanh(y, agents) if pair else elu(y)
+        y = (self.first[pair] @ x if h else
+             self.first_at_start[pair] @ x[:, self.sizes.latent_dim:])
+        y = self._norm_tanh(y) if pair else elu(y)
         after, half = np.empty_like(y), y.shape[1] // 2
         for W, rows in zip(self.second[pair], (slice(0, half), slice(half, None))):
-            np.matmul(W[agents], y[:, rows], out=after[:, rows])
+            np.matmul(W, y[:, rows], out=after[:, rows])
         return elu(after)
 
-    def _norm_tanh(self, y, agents):
+    def _norm_tanh(self, y):
         """tanh(LayerNorm(y)) of both Q."""
         shape, y = y.shape, y.reshape(len(y), *self.shift.shape[1:3], -1)
-        y /= np.sqrt(self.spread[agents] @ (y * y) + F32(NORM_EPS))     # (N, 2, 1, S)
-        y += self.shift[agents]
+        y /= np.sqrt(self.spread @ (y * y) + F32(NORM_EPS))     # (N, 2, 1, S)
+        y += self.shift
         return np.tanh(y, out=y).reshape(shape)
 
 
@@ -1109,21 +1087,12 @@ def sample_blocks(sizes, samples):
 # ---- The same, in processes: workers plan for a part of the agents each.
 
 
-def split_agents(agents, workers, blocks=1):
-    """Two lists, an entry for this process and for each worker beside it: its agents, a slice; and
-    None or, by block of samples, which of these (from 0) it rolls out. UserError: too many workers.
-
-    The latter where a cut of agents x blocks (512 samples are 2 or 4) falls inside an agent: of 3
-    agents both processes plan agent 1; its first block is rolled out here, its second there."""
+def split_agents(agents, workers):
+    """The agents, a slice, of this process and of each worker beside it. UserError: too many."""
     need(0 <= workers < agents, f"{workers} workers are no use to {agents} agents, one of which is "
          f"left to this process; pass 0 to {agents - 1}")
-    cuts = np.linspace(0, agents * blocks, workers + 2).round().astype(int)
-    parts = [slice(i // blocks, -(-j // blocks)) for i, j in zip(cuts, cuts[1:])]
-    if not (cuts % blocks).any():
-        return parts, [None] * len(parts)
-    first = -((np.arange(blocks) - cuts[:, None]) // blocks)  # agent from each cut on, by block
-    return parts, [[slice(i, j) for i, j in zip(begin - part.start, end - part.start)]
-                   for part, begin, end in zip(parts, first, first[1:])]
+    cuts = np.linspace(0, agents, workers + 2).round().astype(int)
+    return [slice(i, j) for i, j in zip(cuts, cuts[1:])]
 
 
 def cores():
@@ -1137,9 +1106,8 @@ def useful_workers(agents):
 
 
 def _planning_worker(connection):
-    """Plans for its part of the agents: latents in, actions out; a list is `reset`'s seeds. Where
-    agents are shared, each iteration's returns go out and come back added up."""
-    planner = AgentPlanner(*connection.recv(), lambda G: connection.send(G) or connection.recv())
+    """Plans for its part of the agents: latents in, actions out; a list is `reset`'s seeds."""
+    planner = AgentPlanner(*connection.recv())
     connection.send("ready")
     while True:
         message = connection.recv()

@@ -38,7 +38,7 @@ class Predictor:
     """
 
     def __init__(self, model, workers=0):
-        (mine, *theirs), _ = fac.split_agents(model.config.num_agents, workers)
+        mine, *theirs = fac.split_agents(model.config.num_agents, workers)
         self.model = model.agents(mine.start, mine.stop)
         sizes = self.model.config
         self._x = np.random.default_rng(0).standard_normal(
