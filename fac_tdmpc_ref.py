@@ -201,8 +201,6 @@ class DistillConfig(Settings):
                              choices=("cosine", "constant"))
     warmup: int = field(200, "steps over which lr rises from zero [D1]", paper=0, least=0)
     grad_clip: float = field(10.0, "largest gradient norm (Table 2)", above=0)
-    sizes: str = field("table2", "agent sizes: table2 (m = 50) or section51 (m = 512 // N)",
-                       choices=("table2", "section51"))
     own_episodes: int = field(16, "episodes that the student plays after each of the first three "
                               "quarters of the steps, to learn from [D8]", paper=0, least=0)
     own_share: float = field(0.25, "share of states from its own episodes [D8]", paper=0.0,
@@ -239,14 +237,13 @@ def from_dict(config_class, values, where):
         raise UserError(f"{where}: {error}") from None
 
 
-def student_config(theirs, num_agents, sizes, encoder_input):
-    """A student's ModelConfig, from its expert's: a latent by `sizes`, hidden max(512 // N, 50)."""
-    width = 512 // max(1, num_agents)
+def student_config(theirs, num_agents, encoder_input):
+    """A student's ModelConfig, from its expert's: latents of 50, hidden max(512 // N, 50)."""
     below = {} if encoder_input == "observation" else {
         "expert_latent_dim": theirs.num_agents * theirs.latent_dim,
         "expert_enc_dim": theirs.enc_dim}
     return ModelConfig(theirs.dim_obs, theirs.dim_action, num_agents,
-                       50 if sizes == "table2" else width, 256, max(width, 50), **below)
+                       50, 256, max(512 // max(1, num_agents), 50), **below)
 
 
 # ==== 2. Layers: each forward beside its backward =====================================
@@ -411,6 +408,13 @@ class Adam:
 def _thread_pools():
     from threadpoolctl import ThreadpoolController
     return ThreadpoolController()
+
+
+@functools.cache
+def keep_memory():
+    """Free a large array, once: glibc then keeps smaller ones, whose page faults took 0.4 of a
+    plan's time. What plans or learns calls it first."""
+    np.empty(1 << 22, F32)
 
 
 def one_thread():
@@ -682,6 +686,7 @@ class Distiller:
     loss, perturb = staticmethod(distill_loss), staticmethod(perturbed_batch)  # or a subclass's own
 
     def __init__(self, expert, replay, config, num_agents=None, seed=0, **sizes):
+        keep_memory()
         theirs = expert.config
         self.train_starts, self.held_out_starts = replay.starts(config.horizon + 1, config.held_out)
         need((replay.dim_obs, replay.dim_action) == (theirs.dim_obs, theirs.dim_action),
@@ -695,7 +700,7 @@ class Distiller:
         agents = theirs.dim_action if num_agents is None else num_agents
         with one_thread():
             self.optimizer, self.student = new_student(expert, dataclasses.replace(student_config(
-                theirs, agents, config.sizes, config.encoder_input), **sizes), seed)
+                theirs, agents, config.encoder_input), **sizes), seed)
         needed = config.steps * config.batch_size // config.reuse
         self.pool_size = max(config.batch_size, min(POOL, needed))
         self._number = None
@@ -901,6 +906,7 @@ class AgentPlanner:
     """Plans for all, some or one of a model's agents."""
 
     def __init__(self, model, config):
+        keep_memory()
         self.model, self.config = model, config
         self.fast = None if config.returns == "plain" else Returns(model)
         self.reset([])
@@ -978,7 +984,6 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
 
 
 # ---- The same, fast: a first reading skips this. `Returns` computes h_step_return.
-np.empty(1 << 22, F32)  # once freed, glibc keeps smaller arrays: page faults took 0.4 of a plan
 
 
 def homogeneous(params, layer):

@@ -322,7 +322,7 @@ def fresh_student(run):
     """The student of a run before it learned anything, which takes as long to plan with; header."""
     expert, header = fac.load_model(fac.data_file(run["task"], "expert.npz"))
     config, agents = fac.DistillConfig(), json.loads(run["settings"])["num_agents"]
-    sizes = fac.student_config(expert.config, agents, config.sizes, config.encoder_input)
+    sizes = fac.student_config(expert.config, agents, config.encoder_input)
     return fac.new_student(expert, sizes, int(run["seed"]))[1], header
 
 

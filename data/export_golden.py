@@ -214,7 +214,7 @@ def write_golden(folder):
     config = fac.from_dict(ExpertConfig, header.get("training", {}), f"{path}: header: training")
     planner = fac.PlannerConfig(samples=64, elites=8, pi_trajs=0)
     distill = fac.DistillConfig(batch_size=8, noise_samples=10, **AS_PRINTED)
-    sizes = fac.student_config(expert.config, expert.config.dim_action, distill.sizes, "latent")
+    sizes = fac.student_config(expert.config, expert.config.dim_action, "latent")
     student = alive(fac.WorldModel.create(sizes, rng), rng)
     g = draw_inputs(expert, replay, student, config, distill, rng)
     header = {"kind": "golden", "task": header["task"], **{

@@ -113,6 +113,7 @@ class Learner:
     about = {"backend": "numpy"}
 
     def __init__(self, sizes, config, rng, dtype=fac.F32):
+        fac.keep_memory()
         model = fac.WorldModel.create(sizes, rng, policy=True, dtype=dtype)
         policy = {k: v for k, v in model.params.items() if k.startswith("_pi")}
         self.config = config

@@ -221,7 +221,7 @@ class OnlineStudent:
 
     def __init__(self, expert, num_agents, config, seed, own):
         self.config, self.seed, self.own = config, seed, own
-        sizes = fac.student_config(expert.config, num_agents, config.sizes, config.encoder_input)
+        sizes = fac.student_config(expert.config, num_agents, config.encoder_input)
         self.optimizer, self.model = fac.new_student(expert, sizes, seed)
 
     def update(self, expert, obs, actions):

@@ -271,12 +271,21 @@ def test_other_numbers_of_agents_are_refused(replay):
             fac.Distiller(random_model(n=1), replay, CONFIG, n)
 
 
-def test_sizes_of_section_5_1():
-    expert = fac.ModelConfig(8, 12, 1, 50, 256, 512)
-    assert fac.student_config(expert, 12, "section51", "latent").latent_dim == 42
-    assert fac.student_config(expert, 12, "table2", "latent").latent_dim == 50
-    assert fac.student_config(expert, 12, "table2", "latent").expert_latent_dim == 50
-    assert fac.student_config(expert, 12, "table2", "observation").expert_latent_dim == 0
+def test_sizes_of_a_student():
+    expert = fac.ModelConfig(8, 12, 1, 60, 256, 512)
+    for agents, hidden in ((1, 512), (3, 170), (12, 50)):
+        found = fac.student_config(expert, agents, "latent")
+        assert (found.latent_dim, found.mlp_dim, found.expert_latent_dim) == (50, hidden, 60)
+    assert fac.student_config(expert, 12, "observation").expert_latent_dim == 0
+
+
+def test_what_learns_keeps_its_memory(replay):
+    from numpy_learner import ExpertConfig, Learner
+    for make in (lambda: fresh(replay, CONFIG), lambda: Learner(
+            fac.ModelConfig(8, 3, 1, 4, 5, 5), ExpertConfig(), np.random.default_rng(0))):
+        fac.keep_memory.cache_clear()
+        made = make()
+        assert fac.keep_memory.cache_info().currsize == 1, made
 
 
 def test_learning_rate_schedule():
@@ -325,7 +334,7 @@ def test_odd_settings_learn_all_the_same(replay, odd, n):
 @pytest.mark.parametrize("encoder_input", ["latent", "observation"])
 def test_sizes_of_one_s_own_leave_what_the_encoder_reads(tmp_path, replay, encoder_input):
     expert, config = random_model(n=1), fac.dataclasses.replace(CONFIG, encoder_input=encoder_input)
-    sizes = fac.student_config(expert.config, 3, "table2", encoder_input)
+    sizes = fac.student_config(expert.config, 3, encoder_input)
     with contextlib.closing(fac.Distiller(expert, replay, config, mlp_dim=7)) as distiller:
         assert distiller.student.config == fac.dataclasses.replace(sizes, mlp_dim=7)
         distiller.step()
