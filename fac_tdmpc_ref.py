@@ -39,6 +39,7 @@ import difflib
 import functools
 import itertools
 import json
+import math
 import multiprocessing
 import operator
 import os
@@ -80,13 +81,21 @@ def check_finite(values, update, lr):
 
 # ==== 1. Configuration ================================================================
 
-EPISODE_STEPS = 500  # T: decisions in an episode, 1000 control steps of dm_control
-ACTION_REPEAT = 2  # control steps a decision; their rewards are added
+CONTROL_STEPS = 1000  # of dm_control, in an episode
+ACTION_REPEAT = 2  # control steps a decision, whose rewards are added; a model's file may differ
+EPISODE_STEPS = CONTROL_STEPS // ACTION_REPEAT  # T: decisions in an episode
 
 
-def field(default, help, **about):
+def episode_steps(action_repeat):
+    """T for this many control steps a decision; UserError if an episode doesn't divide by it."""
+    need(action_repeat in divisors(CONTROL_STEPS), f"action_repeat: expected a divisor of "
+         f"{CONTROL_STEPS}, an episode's control steps, found {action_repeat!r}")
+    return CONTROL_STEPS // action_repeat
+
+
+def field(default, help, repr=True, **about):
     """A dataclass field; about: range (`least`, `above`, `most`), `choices`, `paper`'s value."""
-    return dataclasses.field(default=default, metadata={"help": help, **about})
+    return dataclasses.field(default=default, repr=repr, metadata={"help": help, **about})
 
 
 RANGE = {"least": ("at least {}", operator.ge), "above": ("above {}", operator.gt),
@@ -162,13 +171,22 @@ class PlannerConfig(Settings):
                          choices=("fast", "plain"))
     output: str = field("sampled", "the action: an elite drawn by score (TD-MPC's code) or the "
                         "Gaussian's mean", paper="mean", choices=("sampled", "mean"))
+    action_repeat: int = field(ACTION_REPEAT, "control steps a decision: the model file's own",
+                               repr=False)
 
     def __post_init__(self):
         super().__post_init__()
+        if self.horizon >= self.episode_steps:
+            self.refuse("horizon", f"below {self.episode_steps}, an episode's decisions")
         if self.elites > self.samples:
             self.refuse("elites", f"at most samples ({self.samples})")
         if self.min_std > self.max_std:
             self.refuse("min_std", f"at most max_std ({self.max_std})")
+
+    @property
+    def episode_steps(self):
+        """T: decisions in an episode."""
+        return episode_steps(self.action_repeat)
 
     @property
     def num_elites(self):
@@ -696,7 +714,7 @@ class Distiller:
         self.expert, self.replay, self.config, self.seed = expert, replay, config, seed
         need(expert.has_policy or not config.own_episodes, "the expert has no policy, which says "
              "what to do in the student's own states; pass --own-episodes 0")
-        self.own = np.zeros((0, EPISODE_STEPS, replay.dim_obs + replay.dim_action), np.float16)
+        self.own = np.zeros((0, 0, replay.dim_obs + replay.dim_action), np.float16)
         agents = theirs.dim_action if num_agents is None else num_agents
         with one_thread():
             self.optimizer, self.student = new_student(expert, dataclasses.replace(student_config(
@@ -717,7 +735,7 @@ class Distiller:
         is_own = rng.random(size) < (self.config.own_share if len(self.own) else 0)  # [D8]
         if count := is_own.sum():
             episode = rng.integers(len(self.own), size=count)
-            t = rng.integers(EPISODE_STEPS - L + 1, size=count) + np.arange(L)[:, None]
+            t = rng.integers(self.own.shape[1] - L + 1, size=count) + np.arange(L)[:, None]
             seen, played = np.split(self.own[episode, t].swapaxes(1, 2).astype(F32), [dim_obs], 1)
             obs[:, is_own] = seen[0]  # of (L, O, count)
             actions[:, :, is_own] = own_actions(self.expert, seen[0], played, K, rng)
@@ -780,10 +798,11 @@ class Distiller:
         return self.optimizer.t
 
     def add(self, observation, action):
-        """Let episodes (E, T, O), (E, T, A) join `own` (all, T, O + A) [D8]; T: EPISODE_STEPS."""
+        """Let episodes (E, T, O), (E, T, A) join `own` (all, T, O + A) [D8]; any T above H."""
         episodes = np.concatenate([observation, action], 2)
         need((np.abs(episodes) <= 65504).all(), "own episodes: not finite, or above 65504")
-        self.own = np.concatenate([self.own, episodes.astype(np.float16)])
+        episodes = episodes.astype(np.float16)
+        self.own = np.concatenate([self.own, episodes]) if len(self.own) else episodes
         self._number = None  # its pool is drawn again, with them
 
     def state(self):
@@ -793,7 +812,8 @@ class Distiller:
     def load(self, state):
         """Go on from a `state`."""
         self.optimizer.load(state)
-        self.own, self._number = state["own"].reshape(-1, *self.own.shape[1:]), None
+        episodes, steps, _ = state["own"].shape
+        self.own, self._number = state["own"].reshape(episodes, steps, self.own.shape[2]), None
 
     def close(self):
         """Stop the threads."""
@@ -1217,10 +1237,12 @@ class Environment:
     """One of the paper's 11 tasks. MuJoCo is imported here and nowhere else.
 
     Observations are dm_control's dict, concatenated in its own order, float32 (dim O,).
-    Actions (dim A,) in [-1, 1] are scaled to the action spec and applied ACTION_REPEAT times.
+    Actions (dim A,) in [-1, 1] are scaled to the action spec and applied `action_repeat` times.
     Raises UserError for an unknown task or an installation that dm_control can't work with."""
 
-    def __init__(self, task):
+    def __init__(self, task, action_repeat=ACTION_REPEAT):
+        episode_steps(action_repeat)
+        self.action_repeat = action_repeat
         domain, name, self.dim_obs, self.dim_action = lookup_task(task)
         os.environ.setdefault("MUJOCO_GL", "disable")  # states only: needs no display
         try:
@@ -1252,9 +1274,9 @@ class Environment:
         return self._observation(self.env.reset())
 
     def step(self, action):
-        """Apply action (dim A,); returns next observation (dim O,) and reward in [0, 2]."""
+        """Apply action (dim A,); returns next observation (dim O,) and the sum of the rewards."""
         control, reward = self._low + self._scale * (np.asarray(action, np.float64) + 1), 0.0
-        for _ in range(ACTION_REPEAT):
+        for _ in range(self.action_repeat):
             timestep = self.env.step(control)
             reward += timestep.reward
         return self._observation(timestep), reward
@@ -1377,15 +1399,19 @@ def load_model(path, kinds=("expert", "student")):
 
 
 def made_for(header, where):
-    """The discount and the horizon that a model's file was trained, or distilled, for."""
-    found = {}
+    """What a model's file was trained, or distilled, for, as settings of a PlannerConfig: discount,
+    horizon and action repeat, those that it names. The one place that reads them."""
+    found, there = {}, f"{where}: header"
     for group, name in (("training", "discount"), ("training", "horizon"), ("distill", "horizon")):
         settings = header.get(group) or {}
-        need(isinstance(settings, dict), f"{where}: header: {group}: expected settings, found "
+        need(isinstance(settings, dict), f"{there}: {group}: expected settings, found "
              f"{settings!r}")
         if name in settings:
-            from_dict(PlannerConfig, {name: settings[name]}, f"{where}: header: {group}")
+            from_dict(PlannerConfig, {name: settings[name]}, f"{there}: {group}")
             found[name] = settings[name]
+    if "action_repeat" in header:
+        found["action_repeat"] = header["action_repeat"]
+    from_dict(PlannerConfig, found, there)
     return found
 
 
@@ -1462,12 +1488,12 @@ def data_file(task, name):
 def decisions(model, task, config, seeds, environment=None):
     """Plan through the episode of each seed; yields every decision's observation (O,), action
     (A,), reward and seconds of planning. environment: instead of the task's, equally long."""
-    environment = Environment(task) if environment is None else environment
+    environment = Environment(task, config.action_repeat) if environment is None else environment
     planner = Planner(model, config)
     for seed in seeds:
         planner.reset(seed)
         obs = environment.reset(seed)
-        for _ in range(EPISODE_STEPS):
+        for _ in range(config.episode_steps):
             begin = time.perf_counter()
             action = planner.act(obs)
             seconds = time.perf_counter() - begin
@@ -1476,19 +1502,21 @@ def decisions(model, task, config, seeds, environment=None):
 
 
 def _playing_worker(connection):
-    """Sends the decisions of its episodes, 25 at a time, which divides EPISODE_STEPS."""
-    played = decisions(*connection.recv())
-    while part := list(itertools.islice(played, 25)):
+    """Sends the decisions of its episodes, so many at a time."""
+    count, *what = connection.recv()
+    played = decisions(*what)
+    while part := list(itertools.islice(played, count)):
         connection.send(part)
 
 
 def play(model, task, config, seeds, workers=None, label="playing", environment=None):
     """Plan through the episodes of `seeds`: observations (E, T, O), actions (E, T, A), rewards
-    (E, T) and seconds of planning (E, T), with T = EPISODE_STEPS.
+    (E, T) and seconds of planning (E, T), with T = config.episode_steps.
 
     workers: processes that share the episodes [one for each core]; 0, or with an `environment`: all
     in this one. An episode depends on its seed, not on their number."""
-    E, T, sizes = len(seeds), EPISODE_STEPS, model.config
+    E, T, sizes = len(seeds), config.episode_steps, model.config
+    at_once = math.gcd(T, 25)  # decisions of a worker's message: of one episode
     found = [np.zeros((E, T, *shape), F32) for shape in ((sizes.dim_obs,), (sizes.dim_action,))]
     found += [np.zeros((E, T)) for _ in range(2)]
     workers = 0 if environment is not None else min(cores() if workers is None else workers, E)
@@ -1496,11 +1524,11 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
     here, done = decisions(model, task, config, seeds, environment), [0] * len(parts)
     with progress(label, E * T, "decision") as bar, \
             Workers(_playing_worker, workers, "evaluation worker") as pool:
-        pool.send_all((model, task, config, [seeds[i] for i in part]) for part in parts)
+        pool.send_all((at_once, model, task, config, [seeds[i] for i in part]) for part in parts)
         while sum(done) < E * T:  # a disabled bar doesn't count
             for w, part in enumerate(parts):
                 if done[w] < len(part) * T:
-                    played = pool.receive(w) if workers else list(itertools.islice(here, 25))
+                    played = pool.receive(w) if workers else list(itertools.islice(here, at_once))
                     i, t = part[done[w] // T], done[w] % T
                     for array, values in zip(found, zip(*played)):
                         array[i, t:t + len(played)] = values
@@ -1685,7 +1713,9 @@ def read_records(path):
 
 def record_key(model, config, seed):
     """What recorded returns depend on: weights, planner and the episodes' seed."""
-    return f"weights {checksum(model.params.values())}, evaluation seed {seed}, {config}"
+    repeat = ("" if config.action_repeat == ACTION_REPEAT else
+              f", action repeat {config.action_repeat}")
+    return f"weights {checksum(model.params.values())}, evaluation seed {seed}, {config}{repeat}"
 
 
 def record_returns(path, model, config, seed, returns):
@@ -1730,6 +1760,10 @@ def load_data(args):
     check_task(expert.config, args.task)
     Environment(args.task)  # what is missing is missed now, not after the last step
     replay = Replay(args.replay or path.with_name("replay.npz"))
+    repeat = made_for(header, path).get("action_repeat", ACTION_REPEAT)
+    found = made_for(replay.header, replay.path).get("action_repeat", repeat)
+    need(found == repeat, f"{replay.path}: header: action_repeat: expected {repeat}, as the expert "
+         f"was made for, found {found}; pass its own data")
     return expert, header, replay, path
 
 
@@ -1739,6 +1773,7 @@ def distil_and_save(distiller, args, planning, header, out):
     playing = dataclasses.replace(planning, **OWN_BUDGET)
     settings = {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
                 "distill": asdict(config), "data": data_checksums(distiller.expert, replay),
+                "action_repeat": planning.action_repeat,
                 "own_planner": asdict(playing) if config.own_episodes else None}
     if (path := out / "student.npz").exists():  # a run that this one would replace
         before, _ = read_npz(path, ("student",))
@@ -1926,7 +1961,7 @@ def make_parser():
     add("--episodes", type=positive, default=20, help="evaluation episodes [20]")
     add("--workers", type=natural, help="processes that play episodes; 0: this one [cores]")
     add_config(sub, DistillConfig)
-    add_config(sub, PlannerConfig, prefix="plan-", skip=("horizon",))
+    add_config(sub, PlannerConfig, prefix="plan-", skip=("horizon", "action_repeat"))
 
     sub = add_command(commands, "evaluate", command_evaluate, "Plan with a model (expert or "
                       "student) through whole episodes.")
@@ -1937,7 +1972,7 @@ def make_parser():
     add("--record", action="store_true", help="keep them in a .json beside the model, for distill")
     add("--episodes", type=positive, default=20, help="[20]")
     add("--workers", type=natural, help="processes that play episodes; 0: this one [cores]")
-    add_config(sub, PlannerConfig)
+    add_config(sub, PlannerConfig, skip=("action_repeat",))
     return parser
 
 

@@ -176,8 +176,8 @@ class TapDistiller(fac.Distiller):
 class DecodingEnvironment(fac.Environment):
     """A task for TAP's planner: its actions are latent ones."""
 
-    def __init__(self, task, expert, vae):
-        super().__init__(task)
+    def __init__(self, task, expert, vae, action_repeat=fac.ACTION_REPEAT):
+        super().__init__(task, action_repeat)
         self._expert, self._vae, self._obs = expert, vae, None
 
     def reset(self, seed):

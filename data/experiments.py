@@ -246,7 +246,7 @@ def distil(task, seed, case, settings):
     playing = dataclasses.replace(planning, **fac.OWN_BUDGET)
     student, environment = distiller.student, None
     if case == "TAP":  # whose actions are others
-        environment = DecodingEnvironment(task, expert, distiller.vae)
+        environment = DecodingEnvironment(task, expert, distiller.vae, planning.action_repeat)
 
     def play_own(first, count):
         seeds = fac.training_seeds(seed, "own episode", first, count)
@@ -406,16 +406,16 @@ def plan_with(task, seed, case, settings, students):
     fac.need(identity(model, header).items() <= settings.items(), f"{case} of {task}, seed {seed}, "
              f"in data/ or {students}/, has changed; give the command again")
     planning = planning_for(header, settings)
-    environment = (DisturbedEnvironment(task, settings["joint"], settings["kind"])
-                   if settings.get("kind") else None)
+    environment = (DisturbedEnvironment(task, settings["joint"], settings["kind"],
+                                        planning.action_repeat) if settings.get("kind") else None)
     yield measure(model, task, planning, settings["episodes"], environment)
 
 
 class DisturbedEnvironment(fac.Environment):
     """A task whose robot isn't the planner's: one action is noise, or its motor another."""
 
-    def __init__(self, task, joint, kind):
-        super().__init__(task)
+    def __init__(self, task, joint, kind, action_repeat=fac.ACTION_REPEAT):
+        super().__init__(task, action_repeat)
         self._joint = joint if kind == "noise" else None
         self._rng = fac.stream(joint, "disturbance")
         if self._joint is None:  # what the motor gives for a control, of a servo's stiffness, too

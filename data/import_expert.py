@@ -6,8 +6,9 @@
 It reads official TD-MPC `.pt` files ({"model": ..., "model_target": ...} or a bare state dict) and
 the same names in a `.safetensors` or an `.npz`; float64, float32, float16 and bfloat16 (not .npz).
 DIR gets expert.npz and, with --replay (arrays that you have) or --collect (episodes that the expert
-plays now), replay.npz. The expert must read dm_control's observation dict in its own order and
-decide every second control step, as everything here does.
+plays now), replay.npz. The expert must read dm_control's observation dict in its own order. All
+that plays it follows the --action-repeat that the files then name: 2 in TD-MPC's code, 4 for
+reacher, hopper, fish, cheetah and quadruped.
 
 A file is data, whoever made it. A `.pt` is a zip around a pickle, and a pickle is a program:
 `read_pickle` knows the opcodes and names that a state dict is made of and refuses all others, so
@@ -16,7 +17,6 @@ strides) is checked against the bytes that it has. Memory stays below three time
 file (MAX_BYTES, MAX_RATIO), 12 bytes a weight (MAX_WEIGHTS) and 32 MiB.
 """
 import contextlib
-import dataclasses
 import io
 import math
 import pickletools
@@ -386,17 +386,19 @@ def find_replay(path, sizes):
     return {"observation": observation, "action": action, "continues": continues}
 
 
-def collect(model, environment, episodes, seed):
-    """A buffer of episodes that the model plays, each with noise of another deviation."""
-    decisions = episodes * fac.EPISODE_STEPS
-    buffer = ReplayBuffer(environment.dim_obs, environment.dim_action, decisions)
-    with fac.Planner(model) as planner, \
-            fac.progress("collecting", decisions, "decision") as bar:
+def collect(path, environment, episodes, seed):
+    """A buffer of episodes that a file's model plays, each with noise of another deviation."""
+    model, header = fac.load_model(path)
+    config = fac.PlannerConfig(**fac.made_for(header, path))
+    steps = config.episode_steps
+    buffer = ReplayBuffer(*fac.TASKS[header["task"]], episodes * steps, steps=steps)
+    with fac.Planner(model, config) as planner, \
+            fac.progress("collecting", episodes * steps, "decision") as bar:
         for i in range(episodes):
             rng = np.random.default_rng([seed, i])
             std, start = rng.uniform(0, MAX_NOISE), int(rng.integers(2 ** 31))
             episode = Episode(environment, start, exploration_std=std)
-            for _ in range(fac.EPISODE_STEPS):
+            for _ in range(steps):
                 episode.play(planner, 1)
                 bar.update()
             buffer.add(*episode.arrays())
@@ -410,11 +412,13 @@ def run(args):
     need(args.collect is None or args.collect > 1, f"--collect must be at least 2, better "
          f"{LEAST_EPISODES}: distill holds out an episode in {LEAST_EPISODES}; not {args.collect}")
     fac.lookup_task(args.task)
-    environment = fac.Environment(args.task) if args.collect else None  # missed now, if missing
+    fac.PlannerConfig(action_repeat=args.action_repeat)  # refuses what is none
+    environment = args.collect and fac.Environment(args.task, args.action_repeat)  # or misses it
     sizes, weights, kinds = find_expert(args.file, args.task)
-    arrays = find_replay(args.replay, sizes) if args.replay else None
-    out, about = Path(args.out), {"task": args.task, "imported_from": Path(args.file).name}
-    header = {"kind": "expert", "model": dataclasses.asdict(sizes), **about}
+    arrays = args.replay and find_replay(args.replay, sizes)
+    out, about = Path(args.out), {"task": args.task, "imported_from": Path(args.file).name,
+                                  "action_repeat": args.action_repeat}
+    header = {"kind": "expert", "model": vars(sizes), **about}
     for source, name in ((args.file, "expert.npz"), (args.replay, "replay.npz")):
         need(not source or Path(source).resolve() != (out / name).resolve(),
              f"{source}: would be replaced by what is made of it; choose another --out")
@@ -433,11 +437,11 @@ def run(args):
     if environment and not arrays:
         with tempfile.TemporaryDirectory() as scratch:  # an expert is replaced with its replay
             fac.write_npz(path := Path(scratch) / "expert.npz", header, weights)
-            buffer = collect(fac.load_model(path)[0], environment, args.collect, args.seed)
+            buffer = collect(path, environment, args.collect, args.seed)
     fac.write_npz(out / "expert.npz", header, weights)
-    result = {"task": args.task, "file": args.file, "out": args.out, "stored_as": kinds,
+    result = {**about, "file": args.file, "out": args.out, "stored_as": kinds,
               "weights": sum(w.size for w in weights.values()), "policy": "_pi.0.weight" in weights,
-              "model": dataclasses.asdict(sizes), "episodes": 0, "transitions": 0, "returns": None}
+              "model": vars(sizes), "episodes": 0, "transitions": 0, "returns": None}
     if arrays:
         fac.write_npz(out / "replay.npz", {"kind": "replay", **about}, arrays, compress=True)
     elif environment:
@@ -477,14 +481,14 @@ def main(argv=None):
     parser.add_argument("file", metavar="FILE", help="checkpoint: " + ", ".join(READERS))
     parser.add_argument("--task", required=True, help="one of: " + ", ".join(fac.TASKS))
     parser.add_argument("--out", required=True, help="folder for expert.npz and replay.npz")
+    parser.add_argument("--action-repeat", type=fac.natural, default=fac.ACTION_REPEAT, metavar="N",
+                        help="control steps of the expert's decisions [%(default)s]")
     data = parser.add_mutually_exclusive_group()
     data.add_argument("--replay", help="an .npz with observation (M, dim O), action (M, dim A) and "
                       "continues (M,), False in each episode's last row")
-    data.add_argument("--collect", type=fac.natural, metavar="N",
-                      help="have the expert play N episodes")
+    data.add_argument("--collect", type=fac.natural, metavar="N", help="have it play N episodes")
     parser.add_argument("--seed", type=fac.natural, default=0, help="of these episodes [0]")
-    parser.add_argument("--json", action="store_true",
-                        help="print one JSON object as the last line of stdout")
+    parser.add_argument("--json", action="store_true", help="print JSON as stdout's last line")
     parser.set_defaults(run=run)
     try:
         return fac.run_command(parser, argv)

@@ -37,10 +37,11 @@ def shares(model, z, config):
     return worth[:, 0] - worth[:, 1]
 
 
-def watch_episode(path, model, header, environment, seed, decisions, every):
+def watch_episode(path, model, header, task, seed, decisions, every):
     """Frames of a model's episode: picture, shares (N,) and return so far of each; its name, the
     median milliseconds of a decision, and the return in the end."""
     config = fac.PlannerConfig(**fac.made_for(header, path))
+    environment = fac.Environment(task, config.action_repeat)
     frames, total, seconds = [], 0.0, []
     with fac.Planner(model, config) as planner, fac.progress(f"playing {path}", decisions,
                                                              "decision") as bar:
@@ -87,8 +88,6 @@ def draw_frames(episodes):
 def command_watch(args):
     """watch: an episode as a moving picture."""
     kind = Path(args.out).suffix
-    fac.need(args.decisions <= fac.EPISODE_STEPS, f"--decisions: an episode has "
-             f"{fac.EPISODE_STEPS}, not {args.decisions}")
     fac.need(kind in (".gif", ".mp4"), f"{args.out}: expected a name that ends in .gif or .mp4")
     fac.check_writable(args.out)
     fac.pyplot()  # brings Pillow
@@ -100,13 +99,19 @@ def command_watch(args):
     if args.beside:
         models.append((args.beside, *fac.load_model(args.beside)))
         fac.check_task(models[1][1].config, task, args.beside)
+    configs = [fac.PlannerConfig(**fac.made_for(header, path)) for path, _, header in models]
+    repeats = {config.action_repeat for config in configs}
+    fac.need(len(repeats) == 1, f"{args.beside}: decides every {configs[-1].action_repeat} control "
+             f"steps, {args.model} every {configs[0].action_repeat}: they can't be shown in step")
+    fac.need(args.decisions <= configs[0].episode_steps, f"--decisions: an episode has "
+             f"{configs[0].episode_steps}, not {args.decisions}")
     choose_renderer()
-    environment = fac.Environment(task)
     (seed,) = fac.episode_seeds(args.seed, 1, first=args.episode)
-    episodes = [watch_episode(*found, environment, seed, args.decisions, args.every)
+    episodes = [watch_episode(*found, task, seed, args.decisions, args.every)
                 for found in models]
     images = draw_frames(episodes)
-    seconds = max(0.02, fac.ACTION_REPEAT * environment.env.control_timestep() * args.every)
+    step = repeats.pop() * fac.Environment(task).env.control_timestep()
+    seconds = max(0.02, step * args.every)
     with fac.atomic_file(args.out) as file:
         if kind == ".mp4":
             import imageio
@@ -175,14 +180,14 @@ def turning_points(returns, count=2):
     return sorted(found)
 
 
-def frames_at(task, seed, actions, moments):
+def frames_at(task, seed, actions, moments, action_repeat):
     """Pictures of an episode, played again, before these decisions; {} where nothing draws."""
     try:
         choose_renderer()
     except fac.UserError as error:
         print(error, file=sys.stderr)
         return {}
-    environment, found = fac.Environment(task), {}
+    environment, found = fac.Environment(task, action_repeat), {}
     environment.reset(seed)
     for t in range(max(moments) + 1):
         if t in moments:
@@ -198,9 +203,10 @@ def command_figure9(args):
     with fac.optional("scikit-learn", "experiments"):
         import sklearn  # noqa: F401  (missed before the episodes are played)
     config = fac.PlannerConfig(**fac.made_for(header, args.model))
-    fac.need(model.config.latent_dim > 1 and config.horizon < fac.EPISODE_STEPS - SMOOTH,
-             f"{args.model}: expected latents of 2 or more and a horizon below "
-             f"{fac.EPISODE_STEPS - SMOOTH}, found {model.config.latent_dim}, {config.horizon}")
+    most = config.episode_steps - SMOOTH
+    fac.need(model.config.latent_dim > 1 and config.horizon < most,
+             f"{args.model}: expected latents of 2 or more and a horizon below {most}, found "
+             f"{model.config.latent_dim}, {config.horizon}")
     seeds = fac.episode_seeds(args.seed, args.episodes)
     obs, actions, rewards, _ = fac.play(model, task, config, seeds)
     returns, rng = rewards.sum(1), np.random.default_rng(0)
@@ -221,7 +227,8 @@ def command_figure9(args):
                                   (int(returns.argmax()), int(returns.argmin()))):
         shares = credit(model, obs[episode], actions[episode], config)
         moments[name] = turning_points(shares.sum(0))
-        pictures = frames_at(task, seeds[episode], actions[episode], moments[name])
+        pictures = frames_at(task, seeds[episode], actions[episode], moments[name],
+                             config.action_repeat)
         for share in shares:
             row[0].plot(share - share.mean(), linewidth=1)
         row[0].plot(shares.sum(0) - shares.sum(0).mean(), "k-")
@@ -281,8 +288,8 @@ def command_agreement(args):
     worst = int(rewards.sum(1).argmin())
     own = agreement(student, expert, np.ascontiguousarray(played[worst].T),
                     np.ascontiguousarray(done[worst].T), rng)
-    width = fac.EPISODE_STEPS // 20
-    when = own.reshape(len(own), -1, width).mean(2)
+    when = np.stack([part.mean(1) for part in np.array_split(own, min(20, own.shape[1]), 1)], 1)
+    width = own.shape[1] / when.shape[1]
     figure, ax = plt.subplots(figsize=(8, 3.6), layout="constrained")
     for j, line in enumerate(when):
         ax.plot(np.arange(len(line)) * width + width / 2, line, marker="os^Dv<>p"[j % 8],

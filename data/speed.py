@@ -266,5 +266,5 @@ def add_commands(commands):
     sub.add_argument("--runs", type=functools.partial(fac.natural, least=10), default=100,
                      help="timings; of decisions a tenth [100]")
     sub.add_argument("--figure", help="draw it into this file [figure6: data/figures/figure6.png]")
-    fac.add_config(sub, fac.PlannerConfig, skip=("pi_trajs",),
+    fac.add_config(sub, fac.PlannerConfig, skip=("pi_trajs", "action_repeat"),
                    **fac.paper_preset(fac.PlannerConfig))

@@ -130,15 +130,15 @@ class Actors:
 class ReplayBuffer:
     """Whole episodes in fixed memory, to learn from; the oldest go when it is full.
 
-    observation (E, T + 1, O), action (E, T, A), reward (E, T) with T = EPISODE_STEPS; capacity in
-    transitions; `count` episodes have been added so far.
+    observation (E, T + 1, O), action (E, T, A), reward (E, T), T = steps; capacity in transitions;
+    `count` episodes have been added so far.
     """
 
-    def __init__(self, dim_obs, dim_action, capacity, dtype=np.float32):
-        episodes, self.count = max(1, capacity // fac.EPISODE_STEPS), 0
-        self.observation = np.zeros((episodes, fac.EPISODE_STEPS + 1, dim_obs), dtype)
-        self.action = np.zeros((episodes, fac.EPISODE_STEPS, dim_action), dtype)
-        self.reward = np.zeros((episodes, fac.EPISODE_STEPS), np.float32)
+    def __init__(self, dim_obs, dim_action, capacity, dtype=np.float32, steps=fac.EPISODE_STEPS):
+        episodes, self.count, self.steps = max(1, capacity // steps), 0, steps
+        self.observation = np.zeros((episodes, steps + 1, dim_obs), dtype)
+        self.action = np.zeros((episodes, steps, dim_action), dtype)
+        self.reward = np.zeros((episodes, steps), np.float32)
 
     def __len__(self):
         """Episodes held."""
@@ -166,7 +166,7 @@ class ReplayBuffer:
         """Segments drawn evenly, float32: observations (H + 1, O, B), actions (H, A, B), rewards
         (H, B), and where they begin: episodes and steps, (B,) each."""
         episode = rng.integers(len(self), size=batch)
-        start = rng.integers(fac.EPISODE_STEPS - steps + 1, size=batch)
+        start = rng.integers(self.steps - steps + 1, size=batch)
         rows = start + np.arange(steps + 1)[:, None]
         obs = self.observation[episode, rows].astype(np.float32)
         action = self.action[episode, rows[:-1]].astype(np.float32)
@@ -180,7 +180,7 @@ class ReplayBuffer:
         held = np.arange(self.count - len(self), self.count) % len(self.reward)
         count = min(episodes or len(held), len(held))
         order = held[::-1][np.arange(count) * len(held) // count][::-1]
-        action = np.zeros((len(order), fac.EPISODE_STEPS + 1, self.action.shape[2]), np.float16)
+        action = np.zeros((len(order), self.steps + 1, self.action.shape[2]), np.float16)
         action[:, :-1] = self.action[order]
         continues = np.ones(action.shape[:2], bool)
         continues[:, -1] = False
@@ -274,7 +274,7 @@ def hindsight(task, buffer, where, obs, reward, rng):
     if not task.startswith("reacher"):
         return
     episode, start = where
-    later = buffer.observation[episode, rng.integers(start + 1, fac.EPISODE_STEPS + 1), 3:5]
+    later = buffer.observation[episode, rng.integers(start + 1, buffer.steps + 1), 3:5]
     moved, fresh = rng.random((2, len(start))) < [[3 / 4], [1 / 3]]
     back = np.where(fresh, obs[0, 3:5] - draw_targets(obs[0], rng), later.T).T
     move_target(obs.swapaxes(1, 2), reward, back.astype(np.float32), moved, task)
@@ -564,7 +564,8 @@ def export(training, out, result):
     """Write replay and models with their returns, and the picture; print a table; the result."""
     args, config = training.args, training.config
     about = {"task": args.task, "seed": args.seed, "decisions": training.decisions,
-             "updates": result["updates"], **training.learner.about,
+             "updates": result["updates"], "action_repeat": fac.ACTION_REPEAT,
+             **training.learner.about,
              "training": dataclasses.asdict(config),
              "training_planner": dataclasses.asdict(training.planning)}
     training.buffer.write(out / "replay.npz", about,
@@ -657,7 +658,7 @@ def make_parser():
     add("--json", action="store_true", help="print one JSON object as the last line of stdout")
     fac.add_config(parser, ExpertConfig, **TRAINING_DEFAULTS)
     fac.add_config(parser, fac.PlannerConfig, "MPPI while training", "plan-",
-                   skip=("discount",))
+                   skip=("discount", "action_repeat"))
     fac.add_config(parser, fac.DistillConfig, "The student (Algorithm 1), on the expert's batches "
                    "and steps", "distill-", skip=NOT_ONLINE, **FOLLOWING_DEFAULTS)
     parser.set_defaults(run=train)

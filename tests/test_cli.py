@@ -734,9 +734,10 @@ def test_a_record_counts_for_its_own_weights_planner_and_episodes_only(tmp_path)
     fac.record_returns(path, model, fac.PlannerConfig(samples=7), 5, [4.0])
     keys = [fac.record_key(*which) for which in (
         (model, config, 5), (model, fac.PlannerConfig(samples=7), 5), (model, config, 6),
-        (model, fac.PlannerConfig(output="mean"), 5), (random_model(seed=1), config, 5))]
+        (model, fac.PlannerConfig(output="mean"), 5), (random_model(seed=1), config, 5),
+        (model, fac.PlannerConfig(action_repeat=4), 5))]
     found = fac.read_records(path)
-    assert [found.pop(key, None) for key in keys] == [[3.0, 5.0], [4.0], None, None, None]
+    assert [found.pop(key, None) for key in keys] == [[3.0, 5.0], [4.0], *[None] * 4]
     assert not found
 
 

@@ -117,6 +117,44 @@ def test_500_decisions_end_where_the_episode_of_dm_control_ends(task, monkeypatc
     assert last == [False] * 999 + [True]
 
 
+@pytest.mark.parametrize("repeat", [1, 4, 8])
+def test_an_action_is_repeated_as_often_as_asked(repeat):
+    """Four times is twice two times: same states, and the rewards added up."""
+    action, seen = np.float32([0.3, -0.5, 0.8, 0.1]), {}
+    for n in (1, repeat):
+        env = fac.Environment("hopper-hop", n)
+        env.reset(3)
+        steps = [env.step(action) for _ in range(16 // n)]
+        seen[n] = steps[-1][0], sum(reward for _, reward in steps)
+    np.testing.assert_allclose(seen[1][0], seen[repeat][0], rtol=1e-6)
+    assert seen[1][1] == pytest.approx(seen[repeat][1])
+    config = fac.PlannerConfig(samples=2, iterations=1, horizon=0, action_repeat=repeat)
+    assert config.episode_steps == 1000 // repeat
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_an_episode_is_1000_control_steps_whatever_the_action_repeat(workers):
+    model = fac.WorldModel.create(fac.ModelConfig(8, 3, 3, 2, 4, 4), np.random.default_rng(0))
+    config = fac.PlannerConfig(samples=2, iterations=1, horizon=0, action_repeat=8)
+    obs, actions, rewards, _ = fac.play(model, "reacher-easy", config, [0], workers)
+    env = fac.Environment("reacher-easy", 1)
+    expected = [env.reset(0)]
+    for action in actions[0]:
+        expected.append([env.step(action)[0] for _ in range(8)][-1])
+    assert rewards.shape == (1, 125) and env.env._step_count == 1000
+    np.testing.assert_allclose(obs[0], expected[:-1], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("repeat", [0, 3, -2, 2000, 2.5, "2"])
+def test_an_action_repeat_that_does_not_divide_an_episode_is_refused(repeat):
+    for refuse in (lambda: fac.Environment("reacher-easy", repeat),
+                   lambda: fac.PlannerConfig(action_repeat=repeat)):
+        with pytest.raises(fac.UserError, match="action_repeat"):
+            refuse()
+    with pytest.raises(fac.UserError, match="horizon must be below 8, an episode's decisions"):
+        fac.PlannerConfig(action_repeat=125, horizon=8)
+
+
 def test_an_environment_of_one_s_own_is_played_here_whatever_its_truth_value():
     class Own(list):
         def reset(self, seed):

@@ -809,8 +809,47 @@ def test_the_share_that_is_advised_holds_out_an_episode(tmp_path, episodes):
     assert len(fac.Replay(tmp_path / "replay.npz").starts(2, share)[1])
 
 
+def test_an_action_repeat_goes_with_the_files_through_distill_and_evaluate(tmp_path, capsys,
+                                                                           monkeypatch):
+    """Episodes, replay, own episodes, evaluation and planner follow it; a replay of another is
+    refused, and so is one that doesn't divide."""
+    monkeypatch.setattr(fac, "CONTROL_STEPS", 40)  # of 1000
+    model, made, played = write_state(tmp_path / "model.pt", weights()), [], []
+    environment, play = fac.Environment, fac.play
+    monkeypatch.setattr(fac, "Environment", lambda task, *repeat: (
+        made.append(repeat), environment(task, *repeat))[1])
+    monkeypatch.setattr(fac, "play", lambda *args, **more: (
+        played.append(found := play(*args, **more)), found)[1])
+    command = [str(model), "--task", TASK, "--collect", "3", "--action-repeat"]
+    assert import_expert.main([*command, "3", "--out", str(tmp_path / "no")]) == 2
+    assert "action_repeat: expected a divisor" in capsys.readouterr().err
+    for repeat in (2, 4):
+        out = tmp_path / str(repeat)
+        assert import_expert.main([*command, str(repeat), "--out", str(out)]) == 0
+        replay = fac.Replay(out / "replay.npz")
+        assert replay.transitions == 3 * 40 // repeat and replay.header["action_repeat"] == repeat
+    assert made == [(2,), (4,)]
+    distill = ["distill", "--task", TASK, "--expert", str(tmp_path / "4"), "--steps", "4",
+               "--own-episodes", "1", "--episodes", "1", "--plan-samples", "4", "--batch-size", "2",
+               "--plan-iterations", "1", "--held-out", "0.34", "--workers", "0", "--out",
+               str(tmp_path / "run")]
+    assert fac.main([*distill, "--replay", str(tmp_path / "2" / "replay.npz")]) == 2
+    assert ("replay.npz: header: action_repeat: expected 4, as the expert was made for, found 2"
+            in capsys.readouterr().err)
+    made.clear()
+    assert fac.main(distill) == 0
+    assert fac.main(["evaluate", "--model", str(tmp_path / "run" / "student.npz"), "--workers", "0",
+                     "--episodes", "1", "--samples", "4"]) == 0
+    assert set(made) == {(), (4,)} and len(played) == 6  # (): whether there is any
+    assert {found[2].shape[1] for found in played} == {10}
+    header, _ = fac.read_npz(tmp_path / "run" / "student.npz", ("student",))
+    assert fac.made_for(header, "student.npz")["action_repeat"] == 4
+    header["action_repeat"] = 7
+    refusal(lambda: fac.made_for(header, "student.npz"), "student.npz: header: action_repeat")
+
+
 def test_collected_episodes_distil_and_depend_on_the_seed_alone(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(fac, "EPISODE_STEPS", 20)  # of 500
+    monkeypatch.setattr(fac, "CONTROL_STEPS", 40)  # of 1000
     model = write_state(tmp_path / "model.pt", weights())
     for out, seed in (("a", 0), ("b", 0), ("c", 1)):
         assert import_expert.main([str(model), "--task", TASK, "--out", str(tmp_path / out),
