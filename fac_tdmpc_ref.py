@@ -37,6 +37,7 @@ import csv
 import dataclasses
 import difflib
 import functools
+import importlib.metadata
 import itertools
 import json
 import math
@@ -58,6 +59,7 @@ from pathlib import Path
 
 import numpy as np
 
+__version__ = "0.1.0"  # to be raised where plans change: recorded returns name it
 F32 = np.float32
 DATA = Path(__file__).resolve().parent / "data"
 
@@ -1702,12 +1704,15 @@ def draw_curve(path, curve, title):
 
 
 def read_records(path):
-    """The returns recorded for a model's file, in the .json file beside it, by `record_key`."""
+    """{`record_key`: (returns, the `software` they are of)} of the .json beside a model's file."""
     path = Path(path).with_suffix(".json")
     try:
         records = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-        return {key: [float(r) for r in returns] for key, returns in records.items()}
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        found = {key: about if isinstance(about, dict) else {"returns": about, "versions": {}}
+                 for key, about in records.items()}  # those without versions are older
+        return {key: ([float(r) for r in about["returns"]], dict(about["versions"]))
+                for key, about in found.items()}
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
         raise UserError(f"{path}: not what evaluate --record writes ({error}); delete it") from None
 
 
@@ -1718,11 +1723,21 @@ def record_key(model, config, seed):
     return f"weights {checksum(model.params.values())}, evaluation seed {seed}, {config}{repeat}"
 
 
+def software():
+    """The versions of what returns depend on beside weights and settings."""
+    return {"fac-tdmpc-ref": __version__, "numpy": np.__version__,
+            "mujoco": importlib.metadata.version("mujoco")}
+
+
 def record_returns(path, model, config, seed, returns):
-    """Keep the returns that `evaluate` gave beside the model's file, unless it holds more."""
+    """Keep the returns that `evaluate` gave beside the model's file, unless it holds more, of the
+    same versions."""
     records, key = read_records(path), record_key(model, config, seed)
-    if len(returns) >= len(records.get(key, [])):
-        write_json(Path(path).with_suffix(".json"), {**records, key: returns})
+    before, of = records.get(key, ([], {}))
+    if len(returns) >= len(before) or of != software():
+        records[key] = returns, software()
+        write_json(Path(path).with_suffix(".json"), {
+            key: {"returns": values, "versions": of} for key, (values, of) in records.items()})
 
 
 def command_distill(args):
@@ -1731,17 +1746,18 @@ def command_distill(args):
     preset = paper_preset if args.preset == "paper" else lambda config: {}
     config = from_args(DistillConfig, args, **preset(DistillConfig))
     expert, header, replay, path = load_data(args)
-    planning = from_args(PlannerConfig, args, **{
-        **preset(PlannerConfig), **made_for(header, path), "horizon": config.horizon})
+    own = from_args(PlannerConfig, args, **{**preset(PlannerConfig), **made_for(header, path)})
+    planning = dataclasses.replace(own, horizon=config.horizon)  # the student's
     out = Path(args.out or f"runs/{args.task}-{args.seed}")
-    record = read_records(path).get(record_key(expert, planning, args.eval_seed), [])
+    record = read_records(path).get(record_key(expert, own, args.eval_seed), ([], {}))
     with contextlib.closing(Distiller(expert, replay, config, args.num_agents,
                                       args.seed)) as distiller:
         out.mkdir(parents=True, exist_ok=True)
         result = distil_and_save(distiller, args, planning, header, out)
     obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
-    result.update(evaluate_both(expert, record, distiller.student, args, planning))
-    result.update(time_both(expert, distiller.student, planning, obs))
+    both = (expert, own), (distiller.student, planning)
+    result.update(evaluate_both(*both, record, args))
+    result.update(time_both(*both, obs))
     result["seconds_total"] = round(time.time() - began, 1)
     write_json(out / "result.json", result)
     report(result, planning, args.eval_seed)
@@ -1796,14 +1812,21 @@ def distil_and_save(distiller, args, planning, header, out):
             "picture": draw_curve(out / "curve.png", curve, f"{args.task}, seed {args.seed}")}
 
 
-def evaluate_both(expert, record, student, args, planning):
-    """The student's returns and the expert's, from its record or measured: result's part."""
-    where = args.episodes, args.eval_seed, args.workers
-    students = evaluate(student, args.task, planning, *where, "evaluating the student")["returns"]
-    recorded = len(record) >= args.episodes and not args.evaluate_expert
-    experts = record[:args.episodes] if recorded else evaluate(
-        expert, args.task, planning, *where, "evaluating the expert")["returns"]
+def evaluate_both(expert, student, record, args):
+    """The student's returns and the expert's, from its record or measured: result's part.
+
+    expert, student: (model, planning), each over its own horizon; record: (returns, software)."""
+    def returns_of(model, planning, label):
+        return evaluate(model, args.task, planning, args.episodes, args.eval_seed, args.workers,
+                        label)["returns"]
+
+    students, (experts, versions) = returns_of(*student, "evaluating the student"), record
+    recorded = len(experts) >= args.episodes and not args.evaluate_expert
+    experts, versions = (experts[:args.episodes], versions) if recorded else (
+        returns_of(*expert, "evaluating the expert"), software())
     return {"episodes": args.episodes, "eval_seed": args.eval_seed, "expert_recorded": recorded,
+            "expert_versions": versions, "expert_horizon": expert[1].horizon,
+            "student_horizon": student[1].horizon,
             "expert_return_mean": float(np.mean(experts)),
             "expert_return_std": float(np.std(experts)), "expert_returns": experts,
             "student_return_mean": float(np.mean(students)),
@@ -1811,13 +1834,13 @@ def evaluate_both(expert, record, student, args, planning):
             "kept": return_kept(np.mean(students), np.mean(experts))}
 
 
-def time_both(expert, student, planning, obs):
+def time_both(expert, student, obs):
     """Milliseconds of a decision, the expert's with its proposals, the student also with a process
     on each core; where that costs more than it saves, it counts as planning in one. For result."""
-    beside = useful_workers(student.config.num_agents)
+    beside = useful_workers(student[0].config.num_agents)
     with contextlib.ExitStack() as stack:
-        acts = [stack.enter_context(Planner(model, planning, workers=workers)).act
-                for model, workers in ((expert, 0), *((student, n) for n in sorted({0, beside})))]
+        acts = [stack.enter_context(Planner(*planned, workers=workers)).act
+                for planned, workers in ((expert, 0), *((student, n) for n in sorted({0, beside})))]
         seconds = interleaved_seconds([functools.partial(act, obs) for act in acts], 20, "timing")
     central, alone, *parallel = (1e3 * np.median(seconds, 0)).tolist()
     best = min([alone, *parallel])
@@ -1829,15 +1852,18 @@ def report(result, planning, eval_seed):
     """Print distill's table."""
     expert, student = (f"{result[f'{kind}_return_mean']:.0f} ± {result[f'{kind}_return_std']:.0f}"
                        for kind in ("expert", "student"))
-    source = "recorded" if result["expert_recorded"] else "measured now"
-    rows = [(f"expert ({source}), one process", expert, result["plan_ms_expert"]),
-            (f"student, N = {result['num_agents']}, one process", student,
+    source = "measured now" if not result["expert_recorded"] else "recorded" if (
+        result["expert_versions"] == software()) else "recorded with other versions"
+    horizons = [result[f"{kind}_horizon"] for kind in ("expert", "student")]
+    over = [f", H = {h}" if horizons[0] != horizons[1] else "" for h in horizons]
+    rows = [(f"expert ({source}), one process{over[0]}", expert, result["plan_ms_expert"]),
+            (f"student, N = {result['num_agents']}, one process{over[1]}", student,
              result["plan_ms_student_in_process"]),
             (f"student, workers beside: {result['plan_workers']}", "the same plans",
              result["plan_ms_student"])][:3 if result["plan_workers"] else 2]
     print(f"\n{result['task']}, {result['episodes']} episodes, evaluation seed {eval_seed}, MPPI "
           f"with {planning.samples} samples, {planning.iterations} iterations, horizon "
-          f"{planning.horizon}\n")
+          f"{' and '.join(map(str, dict.fromkeys(horizons)))}\n")
     print_table([("", "return", "ms a decision", "speed-up")] + [
         (name, returns, f"{ms:.1f}", f"{rows[0][2] / ms:.1f}") for name, returns, ms in rows])
     q, g = result["rank_correlation_by_step"], result["rank_correlation_returns"]

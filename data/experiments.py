@@ -625,7 +625,8 @@ def expert_level(task, rows):
     if not (path := fac.DATA / task / "expert.npz").exists():
         return None
     expert, header = fac.load_model(path)
-    returns = fac.read_records(path).get(fac.record_key(expert, planning_for(header, about), 0), [])
+    key = fac.record_key(expert, planning_for(header, about), 0)
+    returns, _ = fac.read_records(path).get(key, ([], {}))
     return float(np.mean(returns[:about.get("episodes")])) if returns else None
 
 

@@ -586,7 +586,8 @@ def export(training, out, result):
             mean, std = float(np.mean(returns)), float(np.std(returns))
             result.update({f"{prefix}return_mean": mean, f"{prefix}return_std": std,
                            f"{prefix}returns": returns})
-            rows.append((kind, f"{mean:.0f} ± {std:.0f}", f"{found['plan_ms_median']:.1f}"))
+            rows.append((f"{kind}, H = {planner.horizon}", f"{mean:.0f} ± {std:.0f}",
+                         f"{found['plan_ms_median']:.1f}"))
     if training.student:
         result["lag"] = {str(p): lag(training.curve, p / 100) for p in (50, 75, 90)}
         if args.episodes:

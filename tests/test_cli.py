@@ -379,7 +379,7 @@ def test_distill_prints_json_and_a_table(distilled):
     table = done.stdout
     assert "expert (measured now)" in table and "student, N = 3" in table and "±" in table
     assert f"{result['speedup']:.1f}" in table and "speed-up" in table
-    assert "16 samples, 1 iterations, horizon 1" in table
+    assert "16 samples, 1 iterations, horizon 3 and 1" in table
 
 
 @pytest.mark.parametrize("cores, seconds, workers, best", [
@@ -393,7 +393,8 @@ def test_distill_times_workers_only_where_there_are_cores(cores, seconds, worker
 
     monkeypatch.setattr(fac, "cores", lambda: cores)
     monkeypatch.setattr(fac, "interleaved_seconds", timed)
-    found = fac.time_both(random_model(1), random_model(), fac.PlannerConfig(8, 1), np.zeros(8))
+    planning = fac.PlannerConfig(8, 1)
+    found = fac.time_both((random_model(1), planning), (random_model(), planning), np.zeros(8))
     assert (found["plan_workers"], found["plan_ms_student"]) == (workers, best)
     assert (found["plan_ms_student_in_process"], found["speedup"]) == (2000, 4000 / best)
 
@@ -595,7 +596,8 @@ def test_another_program_s_files_are_not_replaced(tmp_path, files, capsys, name)
 def test_what_is_kept_is_the_student_s_return_by_the_expert_s(monkeypatch):
     monkeypatch.setattr(fac, "evaluate", lambda *_: {"returns": [4.0, 8.0]})
     args = SimpleNamespace(task="x", episodes=2, eval_seed=0, workers=0, evaluate_expert=False)
-    found = fac.evaluate_both(None, [9.0, 15.0, 99.0], None, args, None)
+    planned = None, fac.PlannerConfig()
+    found = fac.evaluate_both(planned, planned, ([9.0, 15.0, 99.0], {}), args)
     assert (found["kept"], found["expert_return_std"], found["student_return_std"]) == (0.5, 3, 2)
 
 
@@ -672,10 +674,10 @@ def test_recorded_returns_stand_for_the_expert_in_distill(tmp_path, files, no_pl
     expert = tmp_path / "expert.npz"
     write_expert(expert)
     done = run("evaluate", "--model", expert, "--task", "reacher-hard", "--episodes", "2",
-               "--workers", "1", "--record", "--json", "--horizon", "1", *BUDGET, cwd=tmp_path)
+               "--workers", "1", "--record", "--json", *BUDGET, cwd=tmp_path)
     measured = last_json(done)
-    ((key, returns),) = fac.read_records(expert).items()
-    assert returns == measured["returns"]
+    ((key, (returns, versions)),) = fac.read_records(expert).items()
+    assert returns == measured["returns"] and versions == fac.software()
     assert "evaluation seed 0" in key and "samples=16" in key
 
     arguments = distill_arguments(files, "--expert", expert, "--num-agents", "1", "--out", "out")
@@ -689,6 +691,13 @@ def test_recorded_returns_stand_for_the_expert_in_distill(tmp_path, files, no_pl
     assert not (tmp_path / "out" / "curve.png").exists()
     with pytest.raises(ValueError):
         json.loads(done.stdout.splitlines()[-1])
+
+    record = expert.with_suffix(".json")
+    for older in ({"numpy": "1.0"}, None):  # None: as records without versions are
+        record.write_text(json.dumps({key: {"returns": returns, "versions": older} if older else
+                                      returns}))
+        done = succeeded(run(*arguments, "--workers", "0", cwd=tmp_path, env=no_plots))
+        assert "expert (recorded with other versions)" in done.stdout
 
     labels = []
 
@@ -705,17 +714,23 @@ def test_recorded_returns_stand_for_the_expert_in_distill(tmp_path, files, no_pl
     assert labels == ["evaluating the student", "evaluating the expert"]
 
 
-def test_a_student_plans_over_the_horizon_it_was_distilled_over(tmp_path, files, monkeypatch):
-    """And its expert beside it; a flag of `evaluate` goes before."""
-    seen = []
+def test_expert_and_student_plan_over_the_horizon_they_were_made_for(tmp_path, files, monkeypatch,
+                                                                     capsys):
+    """And the table says which; a flag of `evaluate` goes before."""
+    seen, timed, planner = [], [], fac.Planner
+    monkeypatch.setattr(fac, "Planner", lambda model, config, **more: (
+        timed.append(config.horizon), planner(model, config, **more))[1])
     monkeypatch.setattr(fac, "evaluate", lambda model, task, planning, *_: (
         seen.append(planning.horizon), {"returns": [1.0], "plan_ms_median": 1.0})[1])
     monkeypatch.setattr(fac, "draw_curve", lambda *_: True)
     arguments = distill_arguments(files, "--horizon", "2", "--out", tmp_path)
     assert fac.main([str(a) for a in arguments]) == 0
+    out = capsys.readouterr().out
+    assert "expert (measured now), one process, H = 3" in out and "one process, H = 2" in out
+    assert timed[:2] == [3, 2]
     evaluation = ["evaluate", "--model", str(tmp_path / "student.npz")]
     assert fac.main(evaluation) == fac.main([*evaluation, "--horizon", "0"]) == 0
-    assert seen == [2, 2, 2, 0]
+    assert seen == [2, 3, 2, 0]
 
 
 def test_a_terminal_without_plus_minus_gets_its_table(tmp_path, files):
@@ -737,11 +752,21 @@ def test_a_record_counts_for_its_own_weights_planner_and_episodes_only(tmp_path)
         (model, fac.PlannerConfig(output="mean"), 5), (random_model(seed=1), config, 5),
         (model, fac.PlannerConfig(action_repeat=4), 5))]
     found = fac.read_records(path)
-    assert [found.pop(key, None) for key in keys] == [[3.0, 5.0], [4.0], *[None] * 4]
+    assert [found.pop(key, None) for key in keys] == [
+        ([3.0, 5.0], fac.software()), ([4.0], fac.software()), *[None] * 4]
     assert not found
 
 
-@pytest.mark.parametrize("text", ["{", "[3]", '"x"', '{"a": 1}', '{"a": ["x"]}'])
+def test_a_record_of_other_versions_gives_way_to_a_shorter_one_of_these(tmp_path):
+    path, about = tmp_path / "expert.npz", (random_model(), fac.PlannerConfig(), 5)
+    path.with_suffix(".json").write_text(json.dumps({fac.record_key(*about): [1.0, 2.0]}))
+    assert list(fac.read_records(path).values()) == [([1.0, 2.0], {})]
+    fac.record_returns(path, *about, [3.0])
+    assert list(fac.read_records(path).values()) == [([3.0], fac.software())]
+
+
+@pytest.mark.parametrize("text", ["{", "[3]", '"x"', '{"a": 1}', '{"a": ["x"]}', '{"a": {}}',
+                                  '{"a": {"returns": [1], "versions": 2}}'])
 def test_a_spoilt_record_is_named(tmp_path, text):
     (tmp_path / "expert.json").write_text(text)
     with pytest.raises(fac.UserError, match="expert.json: not what evaluate --record writes"):
