@@ -1336,6 +1336,25 @@ def check_writable(path):
         raise UserError(f"{path}: can't be written: {error.strerror or error}") from error
 
 
+@contextlib.contextmanager
+def locked(folder):
+    """Make a folder and keep other runs out of it; UserError where one is in it. The lock ends with
+    the process, however that ends; where the system or the folder's disk has none, there is none.
+    """
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    with contextlib.ExitStack() as stack:
+        try:
+            import fcntl
+            stack.callback(os.close, handle := os.open(folder, os.O_RDONLY))
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(f"{folder}: another run is writing into it; wait for its end, or "
+                            "choose another --out") from None
+        except (ImportError, OSError):
+            pass
+        yield
+
+
 def write_npz(path, header, arrays, compress=False):
     """Arrays and a JSON header in one .npz."""
     text = np.frombuffer(json.dumps({"format": FORMAT, **header}).encode(), np.uint8)
@@ -1751,15 +1770,14 @@ def command_distill(args):
     out = Path(args.out or f"runs/{args.task}-{args.seed}")
     record = read_records(path).get(record_key(expert, own, args.eval_seed), ([], {}))
     with contextlib.closing(Distiller(expert, replay, config, args.num_agents,
-                                      args.seed)) as distiller:
-        out.mkdir(parents=True, exist_ok=True)
+                                      args.seed)) as distiller, locked(out):
         result = distil_and_save(distiller, args, planning, header, out)
-    obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
-    both = (expert, own), (distiller.student, planning)
-    result.update(evaluate_both(*both, record, args))
-    result.update(time_both(*both, obs))
-    result["seconds_total"] = round(time.time() - began, 1)
-    write_json(out / "result.json", result)
+        obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
+        both = (expert, own), (distiller.student, planning)
+        result.update(evaluate_both(*both, record, args))
+        result.update(time_both(*both, obs))
+        result["seconds_total"] = round(time.time() - began, 1)
+        write_json(out / "result.json", result)
     report(result, planning, args.eval_seed)
     return result
 

@@ -416,40 +416,41 @@ def run(args):
     environment = args.collect and fac.Environment(args.task, args.action_repeat)  # or misses it
     sizes, weights, kinds = find_expert(args.file, args.task)
     arrays = args.replay and find_replay(args.replay, sizes)
-    out, about = Path(args.out), {"task": args.task, "imported_from": Path(args.file).name,
-                                  "action_repeat": args.action_repeat}
+    about = {"task": args.task, "imported_from": Path(args.file).name,
+             "action_repeat": args.action_repeat}
     header = {"kind": "expert", "model": vars(sizes), **about}
-    for source, name in ((args.file, "expert.npz"), (args.replay, "replay.npz")):
-        need(not source or Path(source).resolve() != (out / name).resolve(),
-             f"{source}: would be replaced by what is made of it; choose another --out")
-    own = (arrays or environment) and (out / "expert.npz").exists()
-    need(own or not (out / "replay.npz").exists(), f"{out / 'replay.npz'}: another expert's; "
-         "choose another --out, or pass --replay or --collect beside its own expert.npz")
-    need(not (out / "checkpoint.npz").exists(), f"{out / 'checkpoint.npz'}: a run of "
-         "train_expert.py, whose files would be replaced; choose another --out")
-    if (path := out / "expert.npz").exists():
-        before, there = fac.read_npz(path, ("expert", "student"))
-        need(before.get("task") == args.task and there.keys() == weights.keys() and all(
-            np.array_equal(there[k], weights[k]) for k in there),
-            f"{path}: another expert, which would be replaced; choose another --out")
-        header = {**before, **header}
-    fac.check_writable(out / "expert.npz")
-    if environment and not arrays:
-        with tempfile.TemporaryDirectory() as scratch:  # an expert is replaced with its replay
-            fac.write_npz(path := Path(scratch) / "expert.npz", header, weights)
-            buffer = collect(path, environment, args.collect, args.seed)
-    fac.write_npz(out / "expert.npz", header, weights)
-    result = {**about, "file": args.file, "out": args.out, "stored_as": kinds,
-              "weights": sum(w.size for w in weights.values()), "policy": "_pi.0.weight" in weights,
-              "model": vars(sizes), "episodes": 0, "transitions": 0, "returns": None}
-    if arrays:
-        fac.write_npz(out / "replay.npz", {"kind": "replay", **about}, arrays, compress=True)
-    elif environment:
-        buffer.write(out / "replay.npz", about)
-        result["returns"] = [float(r) for r in buffer.reward.sum(1)]
-    if arrays or environment:
-        replay = fac.Replay(out / "replay.npz")
-        result.update(episodes=len(replay.ends), transitions=replay.transitions)
+    with fac.locked(out := Path(args.out)):
+        for source, name in ((args.file, "expert.npz"), (args.replay, "replay.npz")):
+            need(not source or Path(source).resolve() != (out / name).resolve(),
+                 f"{source}: would be replaced by what is made of it; choose another --out")
+        need((arrays or environment) and (out / "expert.npz").exists() or
+             not (out / "replay.npz").exists(), f"{out / 'replay.npz'}: another expert's; choose "
+             "another --out, or pass --replay or --collect beside its own expert.npz")
+        need(not (out / "checkpoint.npz").exists(), f"{out / 'checkpoint.npz'}: a run of "
+             "train_expert.py, whose files would be replaced; choose another --out")
+        if (path := out / "expert.npz").exists():
+            before, there = fac.read_npz(path, ("expert", "student"))
+            need(before.get("task") == args.task and there.keys() == weights.keys() and all(
+                np.array_equal(there[k], weights[k]) for k in there),
+                f"{path}: another expert, which would be replaced; choose another --out")
+            header = {**before, **header}
+        fac.check_writable(out / "expert.npz")
+        if environment:
+            with tempfile.TemporaryDirectory() as scratch:  # an expert is replaced with its replay
+                fac.write_npz(path := Path(scratch) / "expert.npz", header, weights)
+                buffer = collect(path, environment, args.collect, args.seed)
+        fac.write_npz(out / "expert.npz", header, weights)
+        result = {**about, "file": args.file, "out": args.out, "stored_as": kinds, "episodes": 0,
+                  "weights": sum(w.size for w in weights.values()), "model": vars(sizes),
+                  "policy": "_pi.0.weight" in weights, "transitions": 0, "returns": None}
+        if arrays:
+            fac.write_npz(out / "replay.npz", {"kind": "replay", **about}, arrays, compress=True)
+        elif environment:
+            buffer.write(out / "replay.npz", about)
+            result["returns"] = [float(r) for r in buffer.reward.sum(1)]
+        if arrays or environment:
+            replay = fac.Replay(out / "replay.npz")
+            result.update(episodes=len(replay.ends), transitions=replay.transitions)
     print(report(result), file=sys.stderr)
     return result
 
@@ -484,8 +485,7 @@ def main(argv=None):
     parser.add_argument("--action-repeat", type=fac.natural, default=fac.ACTION_REPEAT, metavar="N",
                         help="control steps of the expert's decisions [%(default)s]")
     data = parser.add_mutually_exclusive_group()
-    data.add_argument("--replay", help="an .npz with observation (M, dim O), action (M, dim A) and "
-                      "continues (M,), False in each episode's last row")
+    data.add_argument("--replay", help="an .npz with observation, action and continues (README)")
     data.add_argument("--collect", type=fac.natural, metavar="N", help="have it play N episodes")
     parser.add_argument("--seed", type=fac.natural, default=0, help="of these episodes [0]")
     parser.add_argument("--json", action="store_true", help="print JSON as stdout's last line")

@@ -525,9 +525,13 @@ def read_settings(args):
 
 def train(args):
     """Train, or go on, until --steps or --minutes; returns the result."""
-    config, planning, distilling = read_settings(args)
-    out = Path(args.out or f"runs/train-{args.task}-{args.seed}")
-    out.mkdir(parents=True, exist_ok=True)
+    settings, out = read_settings(args), Path(args.out or f"runs/train-{args.task}-{args.seed}")
+    with fac.locked(out):
+        return train_in(out, args, *settings)
+
+
+def train_in(out, args, config, planning, distilling):
+    """`train` in a folder that is its own."""
     training, checkpoint = Training(args, config, planning, distilling), out / "checkpoint.npz"
     if checkpoint.exists():
         training.load(checkpoint)

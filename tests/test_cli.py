@@ -591,6 +591,50 @@ def test_another_program_s_files_are_not_replaced(tmp_path, files, capsys, name)
     assert [path.read_text() for path in tmp_path.iterdir()] == ["an hour's work"]
 
 
+HOLDER = """
+import sys, time
+sys.path[:0] = [sys.argv[1]]
+import fac_tdmpc_ref as fac
+with fac.locked(sys.argv[2]):
+    print("locked", flush=True)
+    time.sleep(100)
+"""
+
+
+def test_two_runs_into_one_folder_do_not_both_begin(tmp_path, files, capsys):
+    """Whatever the first was; one that was killed leaves no lock."""
+    import import_expert
+    import train_expert
+    from test_train import TINY as TRAINING
+    expert, out = str(files / "expert.npz"), str(tmp_path / "out")
+    runs = [(fac.main, distill_arguments(files, "--task", "reacher-hard", "--workers", "0")),
+            (train_expert.main, [*TRAINING, "--minutes", "1e-9"]),
+            (import_expert.main, [expert, "--task", "reacher-hard"])]
+    holder = subprocess.Popen([sys.executable, "-c", HOLDER, ROOT, out], stdout=subprocess.PIPE)
+    assert holder.stdout.readline() == b"locked\n"
+    for main, arguments in runs:
+        assert main([str(a) for a in (*arguments, "--out", out)]) == 2
+        message = capsys.readouterr().err.splitlines()[-1]
+        assert f"error: {out}: another run is writing into it" in message and "--out" in message
+        assert not os.listdir(out)
+    holder.kill()
+    holder.communicate()
+    for i, (main, arguments) in enumerate(runs):
+        free = f"{out}{i}" if i else out
+        assert main([str(a) for a in (*arguments, "--out", free)]) == 0 and os.listdir(free)
+
+
+@pytest.mark.parametrize("missing", ["fcntl", "the disk's locks"])
+def test_where_there_are_no_locks_a_run_goes_on(tmp_path, monkeypatch, missing):
+    import fcntl
+    if missing == "fcntl":
+        monkeypatch.setitem(sys.modules, "fcntl", None)
+    else:
+        monkeypatch.setattr(fcntl, "flock", lambda *_: os.close(-1))  # an OSError
+    with fac.locked(tmp_path / "a" / "b"), fac.locked(tmp_path / "a" / "b"):
+        assert os.listdir(tmp_path / "a") == ["b"]
+
+
 # evaluate and the record of the expert ------------------------------------------------
 
 def test_what_is_kept_is_the_student_s_return_by_the_expert_s(monkeypatch):
