@@ -74,6 +74,13 @@ def need(condition, message):
         raise UserError(message)
 
 
+def count(value, name, most=10 ** 9):
+    """The value, if it's a whole number from 0 to `most`; else UserError."""
+    need(isinstance(value, (int, np.integer)) and 0 <= value <= most,
+         f"{name}: expected a whole number from 0 to {most}, found {value!r}")
+    return value
+
+
 def check_finite(values, update, lr):
     """UserError if learning diverged, before its weights are saved."""
     for name, value in values.items():
@@ -156,10 +163,12 @@ class ModelConfig(Settings):
 @dataclass(frozen=True)
 class PlannerConfig(Settings):
     """MPPI. Raises UserError for values that can't plan."""
-    samples: int = field(128, "S: action sequences drawn in an iteration [D5]", paper=512, least=1)
+    samples: int = field(128, "S: action sequences drawn in an iteration [D5]", paper=512, least=1,
+                         most=10 ** 6)
     iterations: int = field(4, "refinements of the Gaussian in a decision [D5]", paper=6, least=1)
     elites: int = field(0, "best ones, which refine it; 0: samples / 8 (Table 2: 64)", least=0)
-    pi_trajs: int = field(24, "policy proposals, where there is a policy (Table 2)", least=0)
+    pi_trajs: int = field(24, "policy proposals, where there is a policy (Table 2)", least=0,
+                          most=10 ** 6)
     horizon: int = field(3, "H of Equation 2 (Table 2); `evaluate` takes the model file's own",
                          least=0, most=EPISODE_STEPS - 1)
     discount: float = field(0.99, "gamma (Table 2); commands take the model file's own",
@@ -234,10 +243,17 @@ class DistillConfig(Settings):
             self.refuse("own_share", "above 0 where there are own_episodes")
 
 
+def seed_sequence(seed, **options):
+    """NumPy's SeedSequence of a seed; None: the system's own. UserError for what is none."""
+    try:
+        return np.random.SeedSequence(seed, **options)
+    except (TypeError, ValueError):
+        raise UserError(f"seed: expected a whole number of 0 or more, found {seed!r}") from None
+
+
 def stream(seed, use, index=0):
     """The Generator of one use of a run's seed: no two uses, or indices of one, share numbers."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(
-        zlib.crc32(use.encode()), index)))
+    return np.random.default_rng(seed_sequence(seed, spawn_key=(zlib.crc32(use.encode()), index)))
 
 
 def divisors(n):
@@ -255,6 +271,29 @@ def from_dict(config_class, values, where):
         return config_class(**values)
     except UserError as error:
         raise UserError(f"{where}: {error}") from None
+
+
+def memory():
+    """Bytes of memory that this machine, or its container, has; infinite where neither tells."""
+    found = [np.inf]
+    with contextlib.suppress(AttributeError, OSError, ValueError):
+        found.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+        found.append(int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    return min(found)
+
+
+LARGE = ("samples", "pi_trajs", "horizon", "batch_size", "noise_samples", "own_episodes",
+         "buffer_size", "latent_dim", "enc_dim", "mlp_dim")  # settings that memory grows with
+
+
+def check_memory(numbers, *configs):
+    """UserError if so many float32 don't fit in memory, with the setting of the configs to lower:
+    the one that is the furthest above its default."""
+    _, name, value = max((getattr(config, f.name) / max(1, f.default), f.name,
+                          getattr(config, f.name)) for config in configs
+                         for f in dataclasses.fields(config) if f.name in LARGE)
+    need(4 * numbers <= memory(), f"{name} = {value}: it would take about {4e-9 * numbers:.1f} GB "
+         f"of memory, of {1e-9 * memory():.1f} GB here; lower it")
 
 
 def student_config(theirs, num_agents, encoder_input):
@@ -547,6 +586,19 @@ def layers(config, policy=False):
                 yield name, i, kind, (agents, before, 1), False
 
 
+def learning_numbers(config, columns):
+    """About how many numbers Adam, gradients and tapes of a model hold for so many columns."""
+    return sum(agents * (6 * sum(a * b for a, b in zip(widths, widths[1:])) +
+                         3 * columns * sum(widths)) for *_, agents, widths in networks(config))
+
+
+def planning_numbers(sizes, config):
+    """About how many numbers a plan holds: action sequences, and the widest layers of a block."""
+    block = config.samples if config.returns == "plain" else min(config.samples, 512)
+    return (4 * config.samples * (config.horizon + 1) * sizes.dim_action + 4 * sizes.num_agents *
+            (block + config.pi_trajs) * (sizes.latent_dim + 2 * sizes.mlp_dim))
+
+
 def unroll(model, z, actions, transitions, tapes=None):
     """Roll a model's latent out under given actions, every column on its own trajectory.
 
@@ -718,11 +770,16 @@ class Distiller:
              "what to do in the student's own states; pass --own-episodes 0")
         self.own = np.zeros((0, 0, replay.dim_obs + replay.dim_action), np.float16)
         agents = theirs.dim_action if num_agents is None else num_agents
-        with one_thread():
-            self.optimizer, self.student = new_student(expert, dataclasses.replace(student_config(
-                theirs, agents, config.encoder_input), **sizes), seed)
         needed = config.steps * config.batch_size // config.reuse
         self.pool_size = max(config.batch_size, min(POOL, needed))
+        sizes = dataclasses.replace(student_config(theirs, agents, config.encoder_input), **sizes)
+        copies = config.noise_samples * (config.horizon + 1)  # columns of a state
+        check_memory(learning_numbers(sizes, config.batch_size * copies) + copies * (
+            2 * self.pool_size * (theirs.dim_action + 3) + 8 * PART * theirs.mlp_dim) +
+            config.own_episodes * 3 * EPISODE_STEPS * (theirs.dim_obs + theirs.dim_action),
+            config, sizes)
+        with one_thread():
+            self.optimizer, self.student = new_student(expert, sizes, seed)
         self._number = None
         self._threads = ThreadPoolExecutor(2)
         self._halves = [flatten({k: np.zeros_like(v) for k, v in self.optimizer.params.items()})
@@ -971,7 +1028,8 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
     weights are copied: make a new planner when they have changed."""
 
     def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
-        self.model = model
+        self.model, sequence = model, seed_sequence(seed)
+        check_memory(planning_numbers(model.config, config), config, model.config)
         self._parts = split_agents(model.config.num_agents, workers)
         own, *others = ((model.agents(part.start, part.stop), config) for part in self._parts)
         self.own = AgentPlanner(*own)
@@ -979,19 +1037,23 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
         self._workers = self.enter_context(Workers(_planning_worker, workers, "planning worker"))
         self._workers.send_all(others)
         self._workers.receive_all()  # they are ready: no decision waits for their start
-        self.reset(np.random.SeedSequence(seed).entropy)  # None: the system's own
+        self.reset(sequence.entropy)
 
     def reset(self, seed=None):
         """Start an episode: forget the last plan's mean; a seed also starts the streams anew."""
         n = self.model.config.num_agents
-        seeds = [] if seed is None else np.random.SeedSequence(seed).spawn(n)
+        seeds = [] if seed is None else seed_sequence(seed).spawn(n)
         self._workers.send_all(seeds[part] for part in self._parts[1:])
         self.own.reset(seeds[self._parts[0]])
 
     def act(self, obs):
         """obs (O,) -> action (A,), float32 in [-1, 1]. UserError: other shape, NaN, no finite G."""
-        obs = np.asarray(obs, F32)
         shape = (self.model.config.dim_obs,)
+        try:
+            obs = np.asarray(obs, F32)
+        except (TypeError, ValueError):
+            raise UserError(f"observation: expected numbers of shape {shape}, found what NumPy "
+                            "makes no array of them of") from None
         need(obs.shape == shape, f"observation: expected shape {shape}, found {obs.shape}")
         need(np.isfinite(obs).all(), "observation: holds values that are not finite")
         with one_thread():
@@ -1116,8 +1178,7 @@ def sample_blocks(sizes, samples):
 
 def split_agents(agents, workers):
     """The agents, a slice, of this process and of each worker beside it. UserError: too many."""
-    need(0 <= workers < agents, f"{workers} workers are no use to {agents} agents, one of which is "
-         f"left to this process; pass 0 to {agents - 1}")
+    count(workers, "workers (an agent is left to this process)", agents - 1)
     cuts = np.linspace(0, agents, workers + 2).round().astype(int)
     return [slice(i, j) for i, j in zip(cuts, cuts[1:])]
 
@@ -1295,7 +1356,8 @@ def lookup_task(task):
 
 def episode_seeds(seed, episodes, first=0):
     """Seeds of an evaluation's episodes from `first` on: independent, whatever their number."""
-    streams = np.random.SeedSequence(seed, n_children_spawned=first).spawn(episodes)
+    streams = seed_sequence(seed, n_children_spawned=first).spawn(
+        count(episodes, "episodes", 10 ** 5))
     return [int(s.generate_state(1)[0]) for s in streams]
 
 
@@ -1540,7 +1602,8 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
     at_once = math.gcd(T, 25)  # decisions of a worker's message: of one episode
     found = [np.zeros((E, T, *shape), F32) for shape in ((sizes.dim_obs,), (sizes.dim_action,))]
     found += [np.zeros((E, T)) for _ in range(2)]
-    workers = 0 if environment is not None else min(cores() if workers is None else workers, E)
+    workers = 0 if environment is not None else min(
+        E, cores() if workers is None else count(workers, "workers"))
     parts = [range(w, E, workers or 1) for w in range(workers or 1)]
     here, done = decisions(model, task, config, seeds, environment), [0] * len(parts)
     with progress(label, E * T, "decision") as bar, \
@@ -1771,9 +1834,10 @@ def command_distill(args):
     record = read_records(path).get(record_key(expert, own, args.eval_seed), ([], {}))
     with contextlib.closing(Distiller(expert, replay, config, args.num_agents,
                                       args.seed)) as distiller, locked(out):
+        for model, config in (both := ((expert, own), (distiller.student, planning))):
+            check_memory(planning_numbers(model.config, config), config, model.config)
         result = distil_and_save(distiller, args, planning, header, out)
         obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
-        both = (expert, own), (distiller.student, planning)
         result.update(evaluate_both(*both, record, args))
         result.update(time_both(*both, obs))
         result["seconds_total"] = round(time.time() - began, 1)

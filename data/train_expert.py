@@ -302,8 +302,13 @@ class Training:
     def __init__(self, args, config, planning, distilling):
         _, _, dim_obs, dim_action = fac.lookup_task(args.task)
         self.args, self.config, self.planning = args, config, planning
-        self.learner = make_learner(args, fac.ModelConfig(
-            dim_obs, dim_action, 1, config.latent_dim, config.enc_dim, config.mlp_dim), config)
+        sizes = fac.ModelConfig(dim_obs, dim_action, 1, config.latent_dim, config.enc_dim,
+                                config.mlp_dim)
+        held = min(config.buffer_size, args.steps) * (dim_obs + dim_action + 1)
+        fac.check_memory(held + fac.learning_numbers(
+            sizes, config.batch_size * (config.horizon + 1)), config)
+        fac.check_memory(fac.planning_numbers(sizes, planning), planning, sizes)
+        self.learner = make_learner(args, sizes, config)
         new_buffer = functools.partial(ReplayBuffer, dim_obs, dim_action, config.buffer_size,
                                        np.dtype(config.buffer_dtype))
         self.buffer = new_buffer()
@@ -583,8 +588,8 @@ def export(training, out, result):
         fac.save_model(out / f"{kind}.npz", model, header)
         if args.episodes:
             planner = fac.PlannerConfig(**fac.made_for(header, out))
-            found = fac.evaluate(model, args.task, planner, args.episodes,
-                                 label=f"evaluating the {kind}")
+            found = fac.evaluate(model, args.task, planner, args.episodes, 0, args.workers,
+                                 f"evaluating the {kind}")
             returns = found["returns"]
             fac.record_returns(out / f"{kind}.npz", model, planner, 0, returns)
             mean, std = float(np.mean(returns)), float(np.std(returns))

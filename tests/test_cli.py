@@ -635,6 +635,16 @@ def test_where_there_are_no_locks_a_run_goes_on(tmp_path, monkeypatch, missing):
         assert os.listdir(tmp_path / "a") == ["b"]
 
 
+def test_memory_that_is_not_there_is_refused_before_hours_of_work(tmp_path, files, capsys,
+                                                                  monkeypatch):
+    monkeypatch.setattr(fac, "memory", lambda: 10 ** 7)
+    monkeypatch.setattr(fac, "learning_numbers", lambda *_: 0)
+    monkeypatch.setattr(fac.Distiller, "step", None)
+    arguments = distill_arguments(files, "--plan-samples", "100000", "--out", tmp_path / "out")
+    assert fac.main([str(a) for a in arguments]) == 2
+    assert "error: samples = 100000: it would take about" in capsys.readouterr().err
+
+
 # evaluate and the record of the expert ------------------------------------------------
 
 def test_what_is_kept_is_the_student_s_return_by_the_expert_s(monkeypatch):

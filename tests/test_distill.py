@@ -279,6 +279,33 @@ def test_sizes_of_a_student():
     assert fac.student_config(expert, 12, "observation").expert_latent_dim == 0
 
 
+@pytest.mark.parametrize("name, settings", [
+    ("noise_samples", {"noise_samples": 10 ** 8}), ("batch_size", {"batch_size": 10 ** 8}),
+    ("horizon", {"horizon": 28, "noise_samples": 10}), ("own_episodes", {"own_episodes": 10 ** 7}),
+    ("mlp_dim", {})])
+def test_memory_that_is_not_there_is_refused_before_it_is_taken(replay, monkeypatch, name,
+                                                                settings):
+    monkeypatch.setattr(fac, "memory", lambda: 5 * 10 ** 7)
+    more = {} if settings else {"mlp_dim": 10 ** 5}
+    config = fac.dataclasses.replace(CONFIG, **{"horizon": 3, **settings})
+    with pytest.raises(fac.UserError, match=f"^{name} = .* of memory, of 0.1 GB here; lower it"):
+        fac.Distiller(random_model(n=1, policy=True), replay, config, **more)
+
+
+@pytest.mark.parametrize("sizes", [{}, {"mlp_dim": 200}])
+def test_a_step_takes_about_the_memory_that_it_is_said_to(replay, sizes):
+    import tracemalloc
+    config = fac.dataclasses.replace(CONFIG, batch_size=128, noise_samples=10)
+    distiller = fac.Distiller(random_model(n=1, policy=True), replay, config, **sizes)
+    distiller.step()
+    tracemalloc.start()
+    distiller.step()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    distiller.close()
+    assert 0.5 < 4 * fac.learning_numbers(distiller.student.config, 128 * 40) / peak < 3
+
+
 def test_what_learns_keeps_its_memory(replay):
     from numpy_learner import ExpertConfig, Learner
     for make in (lambda: fresh(replay, CONFIG), lambda: Learner(

@@ -1,4 +1,5 @@
 """MPPI on problems with known answers, Proposition 1, the fast returns, and the workers."""
+import multiprocessing
 import os
 import platform
 import signal
@@ -273,9 +274,67 @@ def test_processes_share_the_agents_evenly_and_none_twice():
         assert len(parts) == workers + 1 and max(sizes) - min(sizes) <= 1
 
 
-def test_too_many_workers_are_refused():
-    with pytest.raises(fac.UserError, match="0 to 2"):
-        fac.Planner(random_model(), workers=3)
+@pytest.mark.parametrize("workers", [3, -1, 1.0, "1", None])
+def test_what_is_no_number_of_workers_is_refused(workers):
+    with pytest.raises(fac.UserError, match="^workers .* from 0 to 2, found"):
+        fac.Planner(random_model(), workers=workers)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "x"])
+def test_what_is_no_seed_is_refused_and_leaves_no_worker(seed):
+    before = multiprocessing.active_children()
+    for refused in (lambda: fac.Planner(random_model(), seed=seed, workers=1),
+                    lambda: fac.Planner(random_model()).reset(seed),
+                    lambda: fac.stream(seed, "x"), lambda: fac.episode_seeds(seed, 2)):
+        with pytest.raises(fac.UserError, match="seed: expected a whole number of 0 or more"):
+            refused()
+    assert multiprocessing.active_children() == before
+
+
+@pytest.mark.parametrize("obs", [["a"] * 8, [[1], [1, 2]] + [[]] * 6, [{}] * 8, "abc"])
+def test_what_is_no_observation_is_refused(obs):
+    with pytest.raises(fac.UserError, match=r"observation: expected numbers of shape \(8,\)"):
+        fac.Planner(random_model(), fac.PlannerConfig(samples=4)).act(obs)
+
+
+@pytest.mark.parametrize("count", [-1, 2.0, "2", 10 ** 9])
+def test_what_is_no_number_of_episodes_or_workers_is_refused(count):
+    with pytest.raises(fac.UserError, match="episodes: expected a whole number from 0"):
+        fac.episode_seeds(0, count)
+    if count != 10 ** 9:
+        with pytest.raises(fac.UserError, match="workers: expected a whole number from 0"):
+            fac.play(random_model(), "reacher-easy", fac.PlannerConfig(), [1], count)
+
+
+def test_memory_that_is_not_there_is_refused_before_it_is_taken(monkeypatch):
+    """In one line that names the setting, here the one furthest above its default."""
+    model = random_model()
+    for config, part in ((fac.PlannerConfig(samples=10_000, horizon=499), "horizon = 499: it wou"),
+                         (fac.PlannerConfig(samples=10 ** 6), "samples = 1000000: it would take"),
+                         (fac.PlannerConfig(samples=4, pi_trajs=10 ** 6), "pi_trajs = 1000000: ")):
+        with monkeypatch.context() as patch:
+            patch.setattr(fac, "memory", lambda: 10 ** 7)
+            with pytest.raises(fac.UserError, match=part):
+                fac.Planner(model, config)
+            patch.setattr(fac, "memory", lambda: 10 ** 13)
+            fac.Planner(model, config)
+    with pytest.raises(fac.UserError, match="samples must be at least 1 and at most 1000000"):
+        fac.PlannerConfig(samples=10 ** 8)
+
+
+def test_a_plan_takes_about_the_memory_that_it_is_said_to():
+    import tracemalloc
+    small, large = fac.ModelConfig(8, 21, 21, 50, 256, 50), fac.ModelConfig(8, 6, 1, 50, 256, 512)
+    for sizes, samples, returns in ((small, 4000, "fast"), (large, 512, "fast"),
+                                    (large, 1000, "plain")):
+        config = fac.PlannerConfig(samples=samples, returns=returns, iterations=1)
+        planner = fac.Planner(fac.WorldModel.create(sizes, np.random.default_rng(0)), config)
+        planner.act(np.zeros(8))
+        tracemalloc.start()
+        planner.act(np.zeros(8))
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert 0.5 < 4 * fac.planning_numbers(sizes, config) / peak < 3
 
 
 def test_a_dead_worker_is_reported_and_nothing_hangs():

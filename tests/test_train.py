@@ -277,10 +277,12 @@ def test_evaluations_and_their_ratio_are_of_whom_they_name(monkeypatch, tmp_path
     found.note([(1, "expert"), (2, "student")], [(np.float32([3, 4]),), (np.float32([1, 1]),)])
     assert found.curve == [{"decisions": 500, "eval_expert": 7, "eval_student": 2}]
     found.buffer.add(*episode(np.random.default_rng(0), 1))
-    monkeypatch.setattr(fac, "evaluate", lambda *_, label: {
-        "returns": [4.0 if label.endswith("student") else 8.0], "plan_ms_median": 1.0})
+    workers = []
+    monkeypatch.setattr(fac, "evaluate", lambda *where: (workers.append(where[5]), {
+        "returns": [4.0 if where[6].endswith("student") else 8.0], "plan_ms_median": 1.0})[1])
     monkeypatch.setattr(train_expert, "draw", lambda *_: True)
     assert train_expert.export(found, tmp_path, {"updates": 0})["ratio"] == 0.5
+    assert workers == [1, 1]  # --workers
 
 
 def test_the_number_of_workers_changes_nothing(trained, tmp_path):
