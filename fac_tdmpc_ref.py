@@ -234,8 +234,8 @@ class DistillConfig(Settings):
                               "quarters of the steps, to learn from [D8]", paper=0, least=0)
     own_share: float = field(0.25, "share of states from its own episodes [D8]", paper=0.0,
                              least=0, most=1)
-    held_out: float = field(0.05, "about this share of episodes is held out, for rank correlations",
-                            least=1e-4, most=0.5)
+    held_out: float = field(0.1, "about this share of episodes is held out, for rank correlations, "
+                            "others for each seed", least=1e-4, most=0.5)
 
     def __post_init__(self):
         super().__post_init__()
@@ -594,9 +594,10 @@ def learning_numbers(config, columns):
 
 def planning_numbers(sizes, config):
     """About how many numbers a plan holds: action sequences, and the widest layers of a block."""
-    block = config.samples if config.returns == "plain" else min(config.samples, 512)
-    return (4 * config.samples * (config.horizon + 1) * sizes.dim_action + 4 * sizes.num_agents *
-            (block + config.pi_trajs) * (sizes.latent_dim + 2 * sizes.mlp_dim))
+    S, P = config.samples, config.pi_trajs
+    block = S if config.returns == "plain" else S // sample_blocks(sizes, S)
+    return (2 * (S + P) * (config.horizon + 1) * sizes.dim_action +
+            3 * (block + P) * sizes.num_agents * (sizes.latent_dim + 2 * sizes.mlp_dim))
 
 
 def unroll(model, z, actions, transitions, tapes=None):
@@ -689,9 +690,20 @@ def distill_loss(student, features, actions, targets, config, grads=None, diverg
     the mean divergences of reward and value over steps and states. divergence: D, as `soft_kl`."""
     tapes, encoder_tape = defaultdict(list), []
     z = student.encode_features(features, encoder_tape)
-    outputs = predict(student, z, actions, tapes)
+    losses, d_outputs = divergences(predict(student, z, actions, tapes), targets, config,
+                                    divergence)
+    if grads is not None:
+        dz = predict_backward(student, tapes, d_outputs, grads)
+        backward(ENCODER, student.params, "_encoder", encoder_tape,
+                 dz.reshape(1, -1, z.shape[-1]), grads)
+    return losses
+
+
+def divergences(outputs, targets, config, divergence=soft_kl):
+    """The sum in `distill_loss` of a student's and its expert's `predict`: what that returns, and
+    the gradients by the student's outputs, three (L, B, K)."""
     L, B, _ = outputs[0].shape
-    lam = (config.lam ** np.arange(L) / B).astype(z.dtype)[:, None]
+    lam = (config.lam ** np.arange(L) / B).astype(outputs[0].dtype)[:, None]
     loss, means, d_outputs = 0.0, [], []
     coefs = (config.reward_coef, config.value_coef, config.value_coef)
     for coef, output, target in zip(coefs, outputs, targets):
@@ -700,10 +712,7 @@ def distill_loss(student, features, actions, targets, config, grads=None, diverg
         loss += coef * float((lam * kl).sum())
         means.append(float(kl.mean()))
         d_outputs.append(coef * lam[..., None] * d_output)
-    if grads is not None:
-        dz = predict_backward(student, tapes, d_outputs, grads)
-        backward(ENCODER, student.params, "_encoder", encoder_tape, dz.reshape(1, -1, B), grads)
-    return loss, means[0], (means[1] + means[2]) / 2
+    return (loss, means[0], (means[1] + means[2]) / 2), d_outputs
 
 
 def new_student(expert, config, seed):
@@ -760,7 +769,8 @@ class Distiller:
     def __init__(self, expert, replay, config, num_agents=None, seed=0, **sizes):
         keep_memory()
         theirs = expert.config
-        self.train_starts, self.held_out_starts = replay.starts(config.horizon + 1, config.held_out)
+        self.train_starts, self.held_out_starts = replay.starts(config.horizon + 1, config.held_out,
+                                                                seed)
         need((replay.dim_obs, replay.dim_action) == (theirs.dim_obs, theirs.dim_action),
              f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, {replay.dim_action}), the "
              f"expert expects ({theirs.dim_obs}, {theirs.dim_action}); pass its own task's replay")
@@ -893,22 +903,52 @@ def horizon_returns(rewards, q1, q2, discount):
     return np.cumsum(gamma * rewards, 0) - gamma * rewards + gamma * (q1 + q2) / 2  # h < H; Q at H
 
 
-def rank_correlation(distiller, states, discount=0.99):
+def rank_by_state(distiller, rows, discount, rng):
     """How alike student and expert order perturbed actions; they agree where the loss is 0.
 
-    Spearman's correlation over 32 action sequences, mean over `states` held-out states; 1 is the
-    same order (section 4.4). Returns that of the global Q at each step h of the rollout, and that
-    of the global return G (Equation 2), by which planning ranks, for each H: two (L,)."""
-    rng = stream(distiller.seed, "rank correlation")
-    starts = rng.choice(distiller.held_out_starts, states)
+    Spearman's correlation over 32 action sequences in the states of the replay's `rows` (B,); 1 is
+    the same order (section 4.4). Returns that of the global Q at each step h of the rollout, and
+    that of the global return G (Equation 2), by which planning ranks, for each H: two (L, B)."""
     student, config = distiller.student, dataclasses.replace(distiller.config, noise_samples=32)
-    obs, actions = distiller.replay.sequences(starts, config.horizon + 1)
+    obs, actions = distiller.replay.sequences(rows, config.horizon + 1)
     with one_thread():
         x, actions, expert = distiller.perturb(distiller.expert, student, obs, actions[..., None],
                                                config, rng)
         found = predict(student, student.encode_features(x), actions)
-    return (spearman(expert[1] + expert[2], found[1] + found[2]).mean(-1),
-            spearman(*(horizon_returns(*out, discount) for out in (expert, found))).mean(-1))
+    return (spearman(expert[1] + expert[2], found[1] + found[2]),
+            spearman(*(horizon_returns(*out, discount) for out in (expert, found))))
+
+
+def rank_correlation(distiller, states, discount=0.99):
+    """The means of `rank_by_state` over so many held-out states, drawn evenly: two (L,)."""
+    rng = stream(distiller.seed, "rank correlation")
+    rows = rng.choice(distiller.held_out_starts, states)
+    return tuple(ranks.mean(-1) for ranks in rank_by_state(distiller, rows, discount, rng))
+
+
+def standard_error(values, groups):
+    """Of the mean of values (L, B), of which those of one group (B,) are alike, as states of one
+    episode are: a list of L; None where all are of one group."""
+    apart = values - values.mean(1, keepdims=True)
+    sums = np.stack([apart[:, groups == group].sum(1) for group in np.unique(groups)])
+    n = len(sums)
+    return None if n < 2 else (np.sqrt(n / (n - 1) * (sums ** 2).sum(0)) / len(groups)).tolist()
+
+
+def rank_results(distiller, states, discount):
+    """`rank_correlation` for result.json, the return's also in states that were learned from."""
+    rng = stream(distiller.seed, "rank correlation")
+    rows = rng.choice(distiller.held_out_starts, states)
+    q, g = rank_by_state(distiller, rows, discount, rng)
+    known = rng.choice(distiller.train_starts, states)
+    episodes = np.searchsorted(distiller.replay.ends, rows)
+    return {"rank_correlation": float(q[0].mean()),
+            "rank_correlation_by_step": q.mean(1).tolist(),
+            "rank_correlation_returns": g.mean(1).tolist(),
+            "rank_correlation_returns_se": standard_error(g, episodes),
+            "rank_correlation_returns_training": rank_by_state(distiller, known, discount, rng)[
+                1].mean(1).tolist(),
+            "rank_correlation_episodes": len(np.unique(episodes))}
 
 
 # ==== 5. Planning: MPPI (Equations 2 and 3), then the worker processes ================
@@ -1523,14 +1563,15 @@ class Replay:
         need(self.ends[-1:].tolist() == [len(self.observation) - 1],
              f"{path}: continues: expected False in the last row")
 
-    def starts(self, length, held_out):
+    def starts(self, length, held_out, seed=0):
         """Rows from which `length` actions stay in their episode: (training, held-out) rows.
 
-        Every (1 / held_out)-th episode is held out, early and late ones. UserError: too few."""
+        Every (1 / held_out)-th episode is held out, early and late ones, which ones by the seed.
+        UserError: too few."""
         every = max(2, round(1 / held_out))
         training, held = [], []
         for i, (begin, end) in enumerate(zip(np.r_[0, self.ends + 1], self.ends)):
-            into = held if i % every == every - 1 else training
+            into = held if (i + 1 - seed) % every == 0 else training
             into.append(np.arange(begin, end - length + 1))
         need(sum(map(len, training)) and sum(map(len, held)),
              f"{self.path}: {len(self.ends)} episodes are too few to hold out a share of "
@@ -1883,14 +1924,13 @@ def distil_and_save(distiller, args, planning, header, out):
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
     curve, seconds = train_student(distiller, out, settings, playing, args.workers)
-    q, g = (x.tolist() for x in rank_correlation(distiller, 256, planning.discount))
     save_model(out / "student.npz", student, {"kind": "student", **settings,
                                               "training": header.get("training", {})})
     write_json(out / "config.json", {**settings, "planner": asdict(planning)})
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
             "steps": config.steps, "seconds": round(seconds, 1), "kl_reward": curve[-1][3],
-            "kl_value": curve[-1][4], "rank_correlation": q[0], "rank_correlation_by_step": q,
-            "rank_correlation_returns": g, "out": str(out),
+            "kl_value": curve[-1][4], **rank_results(distiller, 256, planning.discount),
+            "out": str(out),
             "picture": draw_curve(out / "curve.png", curve, f"{args.task}, seed {args.seed}")}
 
 
@@ -1948,10 +1988,13 @@ def report(result, planning, eval_seed):
           f"{' and '.join(map(str, dict.fromkeys(horizons)))}\n")
     print_table([("", "return", "ms a decision", "speed-up")] + [
         (name, returns, f"{ms:.1f}", f"{rows[0][2] / ms:.1f}") for name, returns, ms in rows])
-    q, g = result["rank_correlation_by_step"], result["rank_correlation_returns"]
+    q, g, known, error = (result[f"rank_correlation_{key}"] for key in (
+        "by_step", "returns", "returns_training", "returns_se"))
     kept = "-" if result["kept"] is None else f"{result['kept']:.2f}"
     print(f"\nreturn kept {kept}, rank correlation of Q {q[0]:.3f} (h = 0) to {q[-1]:.3f} (h = "
-          f"{len(q) - 1}), of the return {g[-1]:.3f}, distilled in {result['seconds']:.0f} s, "
+          f"{len(q) - 1}), of the return {g[-1]:.3f}" + (f" ± {error[-1]:.3f}" if error else "") +
+          f" (standard error over {result['rank_correlation_episodes']} held-out episodes; "
+          f"{known[-1]:.3f} in states of training), distilled in {result['seconds']:.0f} s, "
           f"{result['seconds_total']:.0f} s in all, {result['out']}/")
     print("" if result["picture"] else "pip install 'fac-tdmpc-ref[plots]' draws curve.png, too")
 

@@ -37,10 +37,11 @@ def consistency_loss(student, features, actions, targets, config, grads=None):
     held fixed, of the last of `targets`: what the student reads of the expert's own rollout."""
     *targets, after = targets  # (L, B, K, F)
     tapes, encoder_tape, weight = defaultdict(list), [], 2.0
-    loss, *means = fac.distill_loss(student, features, actions, targets, config, grads)
     z = student.encode_features(features, encoder_tape)
     L, _, B, K = actions.shape
     x, end = fac.unroll(student, z, actions, L, tapes)
+    (loss, *means), d_outputs = fac.divergences(fac.run_heads(student, x, actions, tapes), targets,
+                                                config)
     n, m = student.config.num_agents, student.config.latent_dim
     own = np.concatenate([x[:, :m, B * K:], end], 2)
     goal = student.encode_features(np.ascontiguousarray(after.reshape(1, -1, after.shape[-1])
@@ -49,9 +50,7 @@ def consistency_loss(student, features, actions, targets, config, grads=None):
     gap, scale = own - goal, weight / (n * m * B * K)
     if grads is not None:
         d_latents = (2 * scale * lam * gap).reshape(n, m, L, -1).transpose(2, 0, 1, 3)
-        outputs = fac.run_heads(student, x, actions, tapes)
-        dz = fac.predict_backward(student, tapes, [np.zeros_like(y) for y in outputs], grads,
-                                  d_latents)
+        dz = fac.predict_backward(student, tapes, d_outputs, grads, d_latents)
         fac.backward(fac.ENCODER, student.params, "_encoder", encoder_tape,
                      dz.reshape(1, -1, B), grads)
     return loss + float(scale * (lam * gap ** 2).sum()), *means

@@ -42,7 +42,7 @@ MAX_HEADER = 1 << 17  # bytes of data.pkl, or of a safetensors header; a checkpo
 MAX_WEIGHTS = 1 << 25
 MAX_RANK = 8
 MAX_NOISE = 0.5  # largest deviation of the noise on collected actions
-LEAST_EPISODES = 20  # distill holds out one in 20
+LEAST_EPISODES = 10  # distill holds out one in 10
 RESAVE = "torch.load it where it was made and torch.save its state_dict() alone"
 ELSEWHERE = "only TD-MPC's official state dicts, for state input, can be imported"
 

@@ -280,7 +280,8 @@ def command_agreement(args):
     plt, rng = pyplot_for(args.out), np.random.default_rng(args.seed)
     config = fac.PlannerConfig(**fac.made_for(header, args.model))
     about = {k: v for k, v in (header.get("distill") or {}).items() if k == "held_out"}
-    _, held_out = replay.starts(1, fac.from_dict(fac.DistillConfig, about, args.model).held_out)
+    share = fac.from_dict(fac.DistillConfig, about, args.model).held_out
+    _, held_out = replay.starts(1, share, fac.count(header.get("seed", 0), f"{args.model}: seed"))
     obs, actions = replay.sequences(rng.choice(held_out, args.states), 1)
     known = agreement(student, expert, obs, actions[0], rng)
     played, done, rewards, _ = fac.play(student, task, config,

@@ -90,11 +90,13 @@ def _acting_worker(connection):
             begun, planners = *values, {}
             environments += [fac.Environment(task) for _ in begun[len(environments):]]
             episodes = [Episode(e, *about) for e, about in zip(environments, begun)]
-        else:
+        elif command == "play":
             decisions, newer = values
             planners.update({name: fac.Planner(*planning) for name, planning in newer.items()})
             for episode in episodes:
                 episode.play(planners.get(episode.player), decisions)
+            connection.send("played")
+        else:
             connection.send([episode.arrays() for episode in episodes])
 
 
@@ -116,7 +118,12 @@ class Actors:
         self._workers.send_all([("play", decisions, planners)] * self._count)
 
     def wait(self):
-        """Until they have; (observations, actions, rewards) of every episode so far."""
+        """Until they have."""
+        self._workers.receive_all()
+
+    def episodes(self):
+        """(observations, actions, rewards) of every episode so far."""
+        self._workers.send_all([("give",)] * self._count)
         played = self._workers.receive_all()
         return [played[i % self._count][i // self._count] for i in range(self._begun)]
 
@@ -415,7 +422,9 @@ class Training:
             end = min(played + self.args.refresh, fac.EPISODE_STEPS)
             actors.play(end - played, {**planners, **self.explorers()})
             losses += self.learn_until(start + due * end // fac.EPISODE_STEPS, bar)
-            episodes, planners = actors.wait(), {}
+            actors.wait()
+            planners = {}
+        episodes = actors.episodes()
         for (_, player, _), episode in zip(playing, episodes):
             (self.student.own if player == "own" else self.buffer).add(*episode)
         self.decisions += quota
@@ -447,8 +456,8 @@ class Training:
         actors.begin(tests := self.tests())
         for played in range(0, fac.EPISODE_STEPS, 25):  # actors notice soon if this process ends
             actors.play(25, {} if played else self.planners())
-            episodes = actors.wait()
-        self.note(tests, episodes)
+            actors.wait()
+        self.note(tests, actors.episodes())
         self.seconds += time.time() - began
 
     def save(self, out):

@@ -16,8 +16,8 @@ def write_replay(path, task="", mark=None):
     observation = rng.standard_normal((24 * 31, 8)).astype(np.float16)
     action = rng.uniform(-1, 1, (24 * 31, 3)).astype(np.float16)
     continues = np.tile(np.arange(31) < 30, 24)
-    if mark:
-        observation[np.arange(24 * 31) // 31 == 19] = mark  # CONFIG holds out one in 20
+    if mark:  # CONFIG holds out one in 10
+        observation[np.isin(np.arange(24 * 31) // 31, (9, 19))] = mark
     fac.write_npz(path, {"kind": "replay", "task": task}, {
         "observation": observation, "action": action, "continues": continues})
     return fac.Replay(path)
@@ -78,6 +78,40 @@ def test_rank_correlation_of_the_expert_with_itself_is_one(replay):
     distiller.student = distiller.expert  # reads observations, as N = 1 does
     for of_q_or_return in fac.rank_correlation(distiller, 64):
         assert of_q_or_return.shape == (4,) and np.allclose(of_q_or_return, 1, atol=1e-6)
+
+
+def test_the_ranks_of_a_result_say_in_which_states_and_of_how_many_episodes(replay, monkeypatch):
+    distiller, _ = distilled(replay, CONFIG, 0)
+    found = fac.rank_results(distiller, 64, 0.99)
+    q, g = fac.rank_correlation(distiller, 64)
+    assert found["rank_correlation_by_step"] == q.tolist()
+    assert found["rank_correlation_returns"] == g.tolist()
+    assert found["rank_correlation"] == q[0] and found["rank_correlation_episodes"] == 2
+    monkeypatch.setattr(fac, "rank_by_state", lambda distiller, rows, *rest: (seen.append(rows), [
+        np.tile(np.searchsorted(replay.ends, rows) + 1.0, (4, 1))] * 2)[1])
+    for seed, held in ((0, {9, 19}), (1, {0, 10, 20}), (3, {2, 12, 22})):
+        seen = []
+        with contextlib.closing(fac.Distiller(distiller.expert, replay, CONFIG, seed=seed)) as one:
+            found = fac.rank_results(one, 64, 0.99)
+        of, known = (np.searchsorted(replay.ends, rows) for rows in seen)
+        assert set(of) == held and not set(known) & held and len(set(known)) > 10
+        assert found["rank_correlation_returns_training"] == [known.mean() + 1] * 4
+        assert found["rank_correlation_returns_se"] == fac.standard_error(
+            np.tile(of + 1.0, (4, 1)), of)
+
+
+def test_a_standard_error_is_of_groups_not_of_what_is_in_them():
+    rng, means, told = np.random.default_rng(0), [], []
+    groups = np.repeat(np.arange(6), 40)
+    for _ in range(400):
+        values = np.repeat(rng.standard_normal(6), 40) + 0.1 * rng.standard_normal(240)
+        means.append(values.mean())
+        told.append(fac.standard_error(values[None], groups)[0] ** 2)
+    assert np.mean(told) == pytest.approx(np.var(means), rel=0.2)
+    each = rng.standard_normal((3, 6))
+    np.testing.assert_allclose(fac.standard_error(np.repeat(each, 40, 1), groups),
+                               each.std(1, ddof=1) / np.sqrt(6))
+    assert fac.standard_error(each, np.zeros(6)) is None
 
 
 def test_rank_correlations_are_spearman_s():

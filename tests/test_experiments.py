@@ -401,6 +401,19 @@ def test_gradients_of_the_other_losses(kind, monkeypatch):
         np.testing.assert_allclose(grads[key], numeric, rtol=1e-5, atol=1e-8)
 
 
+def test_consistency_rolls_out_once(monkeypatch):
+    """Equation 4 and the consistency are of one rollout and walk back together."""
+    student, features, actions, targets = loss_inputs()
+    config, calls = fac.DistillConfig(horizon=2), []
+    for name in ("unroll", "run_heads", "predict_backward"):
+        real = getattr(fac, name)
+        monkeypatch.setattr(fac, name, lambda *args, real=real, name=name: (
+            calls.append(name), real(*args))[1])
+    grads = {k: np.zeros_like(v) for k, v in student.params.items() if k[:7] != "_expert"}
+    baselines.consistency_loss(student, features, actions, targets, config, grads)
+    assert calls == ["unroll", "run_heads", "predict_backward"]
+
+
 def test_a_figure12_run_counts_as_finished_by_its_last_row_alone(tmp_path, monkeypatch):
     def train(args):
         Path(args.out).mkdir(parents=True)

@@ -328,7 +328,8 @@ def test_a_plan_takes_about_the_memory_that_it_is_said_to():
     for sizes, samples, returns in ((small, 4000, "fast"), (large, 512, "fast"),
                                     (large, 1000, "plain")):
         config = fac.PlannerConfig(samples=samples, returns=returns, iterations=1)
-        planner = fac.Planner(fac.WorldModel.create(sizes, np.random.default_rng(0)), config)
+        with fac.one_thread():
+            planner = fac.Planner(fac.WorldModel.create(sizes, np.random.default_rng(0)), config)
         planner.act(np.zeros(8))
         tracemalloc.start()
         planner.act(np.zeros(8))

@@ -481,15 +481,20 @@ def test_help_is_quick_and_starts_nothing(tmp_path):
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_actors_equal_single_environments(workers):
-    """Random episodes, a part at a time, in processes: what their actions lead to here."""
-    task, seeds = "reacher-easy", [3, 4, 5]
+def test_actors_equal_single_environments(workers, monkeypatch):
+    """Random episodes, a part at a time, in processes: what their actions lead to here; they are
+    sent once, not all of them after every part."""
+    task, seeds, sent, receive = "reacher-easy", [3, 4, 5], [], fac.Workers.receive
+    monkeypatch.setattr(fac.Workers, "receive", lambda *args: (
+        sent.append(found := receive(*args)), found)[1])
     actors = train_expert.Actors(task, workers)
     try:
         actors.begin([(seed, "explorer", 0.5) for seed in seeds])
         for decisions in (1, 2):
             actors.play(decisions, {})
-            episodes = actors.wait()
+            actors.wait()
+        assert sent == ["played"] * 2 * workers
+        episodes = actors.episodes()
     finally:
         actors.close()
     environment = fac.Environment(task)
