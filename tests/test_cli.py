@@ -191,7 +191,7 @@ def test_preset_paper_is_the_paper(monkeypatch):
     expected = {"steps": 100_000, "batch_size": 512, "noise_samples": 10, "horizon": 3,
                 "lam": 0.5, "reward_coef": 0.5, "value_coef": 0.1,
                 "kl": "reverse", "encoder_input": "observation", "lr": 1e-4,
-                "lr_schedule": "constant", "warmup": 0, "grad_clip": 10, "sizes": "table2",
+                "lr_schedule": "constant", "warmup": 0, "grad_clip": 10,
                 "noise_std": 0.5, "clip_actions": False,
                 "reuse": 1, "own_episodes": 0, "own_share": 0}
     assert {k: found[k] for k in expected} == expected
@@ -222,8 +222,8 @@ def another_value(f):
     (fac.PlannerConfig, "", ["evaluate", "--model", "x"])])
 def test_every_flag_reaches_its_setting(monkeypatch, config_class, prefix, start):
     for f in dataclasses.fields(config_class):
-        if prefix and f.name == "horizon":
-            continue  # distill has one for loss and planning
+        if prefix and f.name == "horizon" or f.name == "action_repeat":
+            continue  # distill has one for loss and planning; a model's file says it
         (flag, *rest), value = another_value(f)
         flag = f"--no-{prefix}{flag[3:]}" if flag.startswith("no-") else f"--{prefix}{flag}"
         found = next(c for c in configs_of(monkeypatch, *start, flag, *rest)
@@ -640,9 +640,9 @@ def test_memory_that_is_not_there_is_refused_before_hours_of_work(tmp_path, file
     monkeypatch.setattr(fac, "memory", lambda: 10 ** 7)
     monkeypatch.setattr(fac, "learning_numbers", lambda *_: 0)
     monkeypatch.setattr(fac.Distiller, "step", None)
-    arguments = distill_arguments(files, "--plan-samples", "100000", "--out", tmp_path / "out")
+    arguments = distill_arguments(files, "--plan-samples", "1000000", "--out", tmp_path / "out")
     assert fac.main([str(a) for a in arguments]) == 2
-    assert "error: samples = 100000: it would take about" in capsys.readouterr().err
+    assert "error: samples = 1000000: it would take about" in capsys.readouterr().err
 
 
 # evaluate and the record of the expert ------------------------------------------------

@@ -368,7 +368,7 @@ def test_an_expert_without_policy_is_imported_with_a_word(tmp_path, capsys):
     assert import_expert.main([str(tmp_path / "model.pt"), "--task", TASK, "--out",
                                str(tmp_path), "--json"]) == 0
     out, err = capsys.readouterr()
-    assert "no policy (_pi)" in err and "--collect 20" in err
+    assert "no policy (_pi)" in err and f"--collect {import_expert.LEAST_EPISODES}" in err
     result = json.loads(out)
     assert result["policy"] is False and result["model"]["mlp_dim"] == 6
     assert not fac.load_model(tmp_path / "expert.npz")[0].has_policy
