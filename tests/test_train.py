@@ -519,7 +519,8 @@ def test_tests_beside_the_training_are_an_evaluation():
         actors.play(200, {"expert": (model, planning)})
         actors.wait()
         actors.play(300, {"explorer": (model, planning)})
-        returns = [reward.sum() for *_, reward in actors.wait()[1:]]
+        actors.wait()
+        returns = [reward.sum() for *_, reward in actors.episodes()[1:]]
     finally:
         actors.close()
     assert returns == fac.evaluate(model, "reacher-easy", planning, 2, 0, 0)["returns"]
