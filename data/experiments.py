@@ -20,6 +20,7 @@ import importlib.util
 import io
 import itertools
 import json
+import multiprocessing
 import os
 import re
 import sys
@@ -47,7 +48,7 @@ RESULTS = fac.DATA / "results"
 KEY = ("task", "seed", "case", "settings")  # what a run is; the rest is what it found
 NUMBERS = ("step", "return_mean", "return_std", "return_min", "expert_mean", "rank_q",
            "rank_return", "ms", "ms_workers", "minutes", "evaluation_seed")
-LISTS = ("returns", "expert_returns", "policy_returns", "ranks")  # as JSON; the first by episode
+LISTS = ("returns", "expert_returns", "policy_returns", "ranks")  # JSON; returns by episode
 ROW = (*KEY, *NUMBERS, *LISTS, "versions", "error")
 
 
@@ -83,7 +84,8 @@ def read_rows(path):
             if len(cells) == len(ROW):  # a kill cuts one line alone
                 numbers = [float(row[key] or 0) for key in NUMBERS]
                 fac.need(np.isfinite(numbers).all() and json.loads(row["settings"]).items, "")
-                fac.need(all(len(json.loads(row[key] or "[1]")) for key in LISTS), "")
+                fac.need(all(isinstance(json.loads(row[key] or "[]"), (list, dict))
+                             for key in LISTS), "")
                 rows.append(row)
         except (ValueError, TypeError, AttributeError, RecursionError, csv.Error, fac.UserError):
             raise fac.UserError(f"{path}: expected numbers from {ROW[4]} on, settings and lists as "
@@ -139,6 +141,7 @@ def attempt(function, run, home):
     """A run's rows; one that fails is a row with its error. home: the process that waits."""
     if home != os.getpid():
         os.environ["TQDM_DISABLE"] = "1"  # a worker's own bars
+        multiprocessing.set_start_method("spawn", force=True)  # loky's can't start a run's workers
         if os.getppid() == home and sys.platform == "linux":  # ends with it
             ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG, SIGKILL
     began = time.time()

@@ -204,6 +204,20 @@ def test_a_run_whose_process_dies_is_a_row_and_stops_nothing(jobs, capfd):
     assert capfd.readouterr().out == ""  # the last line is the command's own
 
 
+def test_a_run_may_have_workers_of_its_own():
+    pytest.importorskip("joblib")
+
+    def function(task, seed, case, settings):
+        expert, _ = fac.load_model(fac.data_file(task, "expert.npz"))
+        sizes = fac.student_config(expert.config, 2, "table2", "expert")
+        student = fac.new_student(expert, sizes, 0)[1]
+        with fac.Planner(student, fac.PlannerConfig(samples=4, iterations=1), workers=1) as planner:
+            yield {"return_mean": float(np.abs(planner.act(np.zeros(17))).max())}
+
+    ((row,),) = experiments.in_processes(function, [experiments.make_run("cheetah-run", 0, "x")], 1)
+    assert 0 < row["return_mean"] <= 1
+
+
 def test_a_run_without_a_finite_return_has_failed():
     run = experiments.make_run("cheetah-run", 0, "x")
     (row,) = experiments.attempt(lambda *_: [{"return_mean": float("nan")}], run, os.getpid())
@@ -221,7 +235,7 @@ def test_a_run_that_does_not_fit_its_figure_is_refused_before_the_work(tmp_path)
 
 @pytest.mark.parametrize("column, value", [
     ("return_mean", "nan"), ("step", "x"), ("settings", "[]"), ("settings", "{"),
-    ("evaluation_seed", "x"), ("returns", 5.0), ("ranks", "{}")])
+    ("evaluation_seed", "x"), ("returns", 5.0), ("ranks", "[0.5")])
 def test_a_damaged_row_is_shown(tmp_path, column, value):
     row = {**experiments.make_run("walker-run", 0, "TAP"), "step": 1, "return_mean": 2.0,
            "minutes": 1.0}
@@ -230,6 +244,18 @@ def test_a_damaged_row_is_shown(tmp_path, column, value):
     experiments.append_rows(tmp_path / "figure4.csv", [{**row, column: value}])
     with pytest.raises(fac.UserError, match=r"figure4.csv: .*TAP.*delete the line"):
         experiments.read_rows(tmp_path / "figure4.csv")
+
+
+def test_a_csv_is_one_command_s_until_it_ends(tmp_path):
+    path = tmp_path / "new" / "7.csv"
+    with experiments.lock(path):
+        with pytest.raises(fac.UserError, match="7.csv: another command is at its runs"):
+            experiments.lock(path)
+        with pytest.raises(fac.UserError, match="another command"):  # which adds milliseconds
+            experiments.time_all(None, {"out": str(path)}, [], None)
+        experiments.append_rows(path, [{**experiments.make_run("x", 0, "y"), "minutes": 1.0}])
+        assert len(experiments.read_rows(path)) == 1
+    experiments.lock(path).close()
 
 
 def test_workers_end_with_the_process_that_waits_for_them(tmp_path):
@@ -887,11 +913,11 @@ def test_report_draws_what_the_csvs_hold(tmp_path):
 
 # students -----------------------------------------------------------------------------
 
-def write_student_rows(path):
+def write_student_rows(path, policy=(90.0, 110.0)):
     """Two seeds of a default student, one of the paper's, and a second budget."""
     def rows(first, second):
         return [{"step": 9, "return_mean": np.mean(returns), "returns": returns,
-                 "expert_returns": [200.0, 50.0], "policy_returns": [90.0, 110.0], "minutes": 6.0,
+                 "expert_returns": [200.0, 50.0], "policy_returns": policy, "minutes": 6.0,
                  "evaluation_seed": evaluation_seed, "ranks": {
                      "rank_correlation_returns": [0.9, 0.5]}}
                 for evaluation_seed, returns in ((1, second), (0, first))]
@@ -923,35 +949,45 @@ def test_the_table_of_students_has_a_line_for_each_budget_and_columns_for_each_p
     other = dict(zip(heads, second))
     assert other["MPPI"] == "512 x 6" and other["kept, paper"] == "-"
     assert list(result) == ["walker-run, 128 x 4", "walker-run, 512 x 6"]
+    write_student_rows(tmp_path / "none.csv", policy=())  # an expert without a policy
+    _, text = experiments.report_students("students", tmp_path / "none.csv", tmp_path)
+    assert "| 125 ± 75 | - | 88 ± 18 |" in text
 
 
-def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path):
-    pytest.importorskip("joblib")
-    flags = ["students", "--tasks", "reacher-easy", "--seeds", "3", "--steps", "1", "--episodes",
-             "2", "--iterations", "1", "--students", str(tmp_path / "runs"), "--out",
-             str(tmp_path / "students.csv"), "--jobs", "1"]
-    for samples in ("8", "8", "4"):
-        assert experiments.main([*flags, "--samples", samples]) == 0
-    student = tmp_path / "runs" / "reacher-easy-3" / "student.npz"
-    rows = experiments.read_rows(tmp_path / "students.csv")
-    assert [row["evaluation_seed"] for row in rows] == ["1", "0"] * 2  # no run was made twice
+def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkeypatch):
+    steps, step, rows = [], fac.Distiller.step, []
+    monkeypatch.setattr(fac.Distiller, "step", lambda self: (steps.append(1), step(self))[1])
+    monkeypatch.setattr(fac, "rank_correlation", lambda *_: (np.full(4, 0.5), np.full(4, 0.25)))
+    monkeypatch.setattr(fac, "time_both", lambda *_: {
+        "plan_ms_expert": 1.0, "plan_ms_student_in_process": 1.0, "plan_workers": 0})
+    monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: rows.extend(
+        row for run in runs for row in experiments.attempt(function, run, os.getpid())))
+    for samples in ("8", "4"):  # another budget: the student is there
+        assert experiments.main([
+            "students", "--tasks", "reacher-easy", "--seeds", "3", "--steps", "1", "--episodes",
+            "1", "--iterations", "1", "--samples", samples, "--students", str(tmp_path)]) == 0
+    experiments.append_rows(path := tmp_path / "students.csv", rows)
+    rows = experiments.read_rows(path)
+    assert [row["evaluation_seed"] for row in rows] == ["1", "0"] * 2 and len(steps) == 1
     assert [json.loads(row["settings"])["samples"] for row in rows] == [8, 8, 4, 4]
-    assert {json.loads(row["settings"])["num_agents"] for row in rows} == {3}
-    model, header = fac.load_model(student)
+    assert len(experiments.finished(rows)) == 2
+    model, header = fac.load_model(tmp_path / "reacher-easy-3" / "student.npz")
     assert (header["seed"], model.config.num_agents, header["distill"]["steps"]) == (3, 3, 1)
-    planning = fac.PlannerConfig(samples=4, iterations=1)
     expert, _ = fac.load_model(fac.data_file("reacher-easy", "expert.npz"))
+    planning = fac.PlannerConfig(samples=4, iterations=1)
     for row in rows[2:]:
-        seeds = fac.episode_seeds(int(row["evaluation_seed"]), 2)
+        seeds = fac.episode_seeds(int(row["evaluation_seed"]), 1)
+        expected = {"policy_returns": students.policy_returns(expert, "reacher-easy", seeds)}
         for key, who in (("returns", model), ("expert_returns", expert)):
-            expected = fac.play(who, "reacher-easy", planning, seeds, 0)[2].sum(1)
-            np.testing.assert_allclose(json.loads(row[key]), expected, atol=1e-3)
-        expected = students.policy_returns(expert, "reacher-easy", seeds)
-        np.testing.assert_allclose(json.loads(row["policy_returns"]), expected, atol=1e-3)
-        assert len(json.loads(row["ranks"])["rank_correlation_returns"]) == 4
+            expected[key] = fac.play(who, "reacher-easy", planning, seeds, 0)[2].sum(1)
+        for key, returns in expected.items():
+            np.testing.assert_allclose(json.loads(row[key]), returns, atol=1e-3)
+        assert json.loads(row["ranks"])["rank_correlation_returns"] == [0.25] * 4
         assert row["versions"] == experiments.versions()
         assert f"numpy {np.__version__}" in row["versions"] and "mujoco 3" in row["versions"]
-    assert json.loads((student.parent / "result.json").read_text())["eval_seed"] == 0
+    result = json.loads((tmp_path / "reacher-easy-3" / "result.json").read_text())
+    assert result["eval_seed"] == 0
+    experiments.report_students("students", path, tmp_path)
 
 
 def test_a_preset_s_students_have_its_budget_and_a_folder_of_their_own(monkeypatch):
