@@ -5,10 +5,11 @@
     python data/experiments.py figure4 --tasks walker-run --seeds 0 1 2
     python data/experiments.py report
 
-Figures 4, 5, 7, 8, 12, 13, departures and `sweep` are lists of runs, each a task, a seed, a case
-and settings. Rows go to one CSV under data/results as runs end; the same command again makes those
-that are missing. `report` draws all but sweeps, from CSVs and the experts' records. Table 3 is in
-speed.py, section 5.6 in look.py, what is distilled in other ways in baselines.py.
+Figures 4, 5, 7, 8, 12, 13, departures, `students` and `sweep` are lists of runs, each a task, a
+seed, a case and settings. Rows go to one CSV under data/results, which one command has at a time,
+as runs end; the same command again makes those that are missing. `report` draws all but sweeps,
+from CSVs and the experts' records. Table 3 is in speed.py, section 5.6 in look.py, what is
+distilled in other ways in baselines.py, statistics and drawing in tables.py.
 """
 import contextlib
 import csv

@@ -93,7 +93,8 @@ def test_table3_measures_every_mode(tmp_path):
     times = [decisions["hopper", m, "section51", "one-thread", 16, 1]["ms_median"]
              for m in ("TD-MPC", "Fac-TDMPC")]
     assert row["paper"] is None and np.isclose(row["value"], times[0] / times[1])
-    for part in ("hopper", "critical-path", "paper's x", "16 x 1", "hand-over"):
+    for part in ("hopper", "critical-path", "paper's x", "section 5.1's sizes", "16 x 1",
+                 "hand-over"):
         assert part in done.stdout
     assert os.listdir(tmp_path) == ["figure6.png"] * ("--figure" in flags)
     if "--figure" in flags:
@@ -329,6 +330,7 @@ def test_dask_gives_the_rows_that_processes_give(tmp_path, monkeypatch):
 def test_bad_runs_are_refused(tmp_path, flags, parts):
     pytest.importorskip("joblib")
     pytest.importorskip("matplotlib")
+    pytest.importorskip("distributed" if flags[-1] in ("nowhere", "tls://host:1") else "joblib")
     before = sorted(experiments.RESULTS.iterdir())
     refused(run(*flags, cwd=tmp_path), *parts)
     assert sorted(experiments.RESULTS.iterdir()) == before  # the default --out
@@ -823,6 +825,7 @@ def test_an_interval_is_as_wide_as_episodes_and_joints_scatter():
     assert found == pytest.approx({"student": 0.7, "expert": 0.6, "difference": 0.1, "low": 0.1,
                                    "high": 0.1})
     assert tables.kept_cell(found) == "**0.70 / 0.60, +0.10 (+0.10 to +0.10)**"
+    assert tables.kept_cell(kept(steady, better)) == "**0.60 / 0.70, -0.10 (-0.10 to -0.10)**"
     one = kept({**steady, ("noise", 0): [80.0] * 5}, steady)  # joints scatter: 0, 0.1 or 0.2
     assert (one["low"], one["high"]) == pytest.approx((0, 0.2)) and "*" not in tables.kept_cell(one)
     lucky = {**steady, ("noise", 0): [20.0, 100, 20, 100, 60], ("noise", 1): [100, 20, 60, 60, 60]}
@@ -834,6 +837,10 @@ def test_an_interval_is_as_wide_as_episodes_and_joints_scatter():
         20.0, 100, 20, 100, 60]}, steady, keep_each=False)
     error = np.std([20, 100, 20, 100, 60], ddof=1) / 5 ** 0.5 / 100  # shared by both joints
     assert blind["high"] == pytest.approx(1.96 * error, rel=0.1) == -blind["low"]
+    whole = kept({**steady, ("none", 0): [90.0, 110, 90, 110, 100], ("noise", 0): [
+        90.0, 110, 90, 110, 100], ("noise", 1): [90.0, 110, 90, 110, 100]}, steady, keep_each=False)
+    error = 2 ** 0.5 * np.std([90, 110, 90, 110, 100], ddof=1) / 5 ** 0.5 / 100  # two lucks
+    assert whole["high"] - whole["low"] == pytest.approx(2 * 1.96 * error, rel=0.1)
     assert kept(steady, {**steady, ("none", 0): [0.0] * 5}) is None
     assert tables.kept_cell(None) == "-"
 
@@ -959,7 +966,8 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
     monkeypatch.setattr(fac.Distiller, "step", lambda self: (steps.append(1), step(self))[1])
     monkeypatch.setattr(fac, "rank_correlation", lambda *_: (np.full(4, 0.5), np.full(4, 0.25)))
     monkeypatch.setattr(fac, "time_both", lambda *_: {
-        "plan_ms_expert": 1.0, "plan_ms_student_in_process": 1.0, "plan_workers": 0})
+        "plan_ms_expert": 1.0, "plan_ms_student_in_process": 1.0, "plan_ms_student": 1.0,
+        "plan_workers": 0})
     monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: rows.extend(
         row for run in runs for row in experiments.attempt(function, run, os.getpid())))
     for samples in ("8", "4"):  # another budget: the student is there
