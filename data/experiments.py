@@ -5,10 +5,11 @@
     python data/experiments.py figure4 --tasks walker-run --seeds 0 1 2
     python data/experiments.py report
 
-Figures 4, 5, 7, 8, 12, 13, departures and `sweep` are lists of runs, each a task, a seed, a case
-and settings. Rows go to one CSV under data/results as runs end; the same command again makes those
-that are missing. `report` draws all but sweeps, from CSVs and the experts' records. Table 3 is in
-speed.py, section 5.6 in look.py, what is distilled in other ways in baselines.py.
+Figures 4, 5, 7, 8, 12, 13, departures, `students` and `sweep` are lists of runs, each a task, a
+seed, a case and settings. Rows go to one CSV under data/results, which one command has at a time,
+as runs end; the same command again makes those that are missing. `report` draws all but sweeps,
+from CSVs and the experts' records. Table 3 is in speed.py, section 5.6 in look.py, what is
+distilled in other ways in baselines.py, statistics and drawing in tables.py.
 """
 import contextlib
 import csv
@@ -20,12 +21,14 @@ import importlib.util
 import io
 import itertools
 import json
+import multiprocessing
 import os
 import re
 import sys
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from concurrent.futures import BrokenExecutor
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -34,14 +37,20 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import fac_tdmpc_ref as fac  # noqa: E402
 import look  # noqa: E402
 import speed  # noqa: E402
+import students  # noqa: E402
 from baselines import DecodingEnvironment, distiller_of  # noqa: E402
+from tables import (  # noqa: E402
+    budget_cells, budgets_of, cell, draw_bars, draw_lines, halves, kept_cell, kept_difference, last,
+    markdown, of_returns)
 
 # ------------------------------------------------------ runs, many at a time, each only once
 
 RESULTS = fac.DATA / "results"
 KEY = ("task", "seed", "case", "settings")  # what a run is; the rest is what it found
-ROW = (*KEY, "step", "return_mean", "return_std", "return_min", "expert_mean", "rank_q",
-       "rank_return", "ms", "ms_workers", "minutes", "error")
+NUMBERS = ("step", "return_mean", "return_std", "return_min", "expert_mean", "rank_q",
+           "rank_return", "ms", "ms_workers", "minutes", "evaluation_seed")
+LISTS = ("returns", "expert_returns", "policy_returns", "ranks")  # JSON; returns by episode
+ROW = (*KEY, *NUMBERS, *LISTS, "versions", "error")
 
 
 def make_run(task, seed, case, **settings):
@@ -74,12 +83,14 @@ def read_rows(path):
         try:
             row = dict(zip(ROW, cells := next(csv.reader([line]), [])))
             if len(cells) == len(ROW):  # a kill cuts one line alone
-                numbers = [float(row[key] or 0) for key in ROW[4:-1]]
+                numbers = [float(row[key] or 0) for key in NUMBERS]
                 fac.need(np.isfinite(numbers).all() and json.loads(row["settings"]).items, "")
+                fac.need(all(isinstance(json.loads(row[key] or "[]"), (list, dict))
+                             for key in LISTS), "")
                 rows.append(row)
-        except (ValueError, AttributeError, RecursionError, csv.Error, fac.UserError):
-            raise fac.UserError(f"{path}: expected numbers from {ROW[4]} on and settings as JSON, "
-                                f"found {line[:200]}; delete the line") from None
+        except (ValueError, TypeError, AttributeError, RecursionError, csv.Error, fac.UserError):
+            raise fac.UserError(f"{path}: expected numbers from {ROW[4]} on, settings and lists as "
+                                f"JSON, found {line[:200]}; delete the line") from None
     return rows
 
 
@@ -90,7 +101,6 @@ def append_rows(path, rows):
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(path, "a+b") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)  # of two commands one writes
             file.seek(0)
             before = file.read()
             if b"\n" not in before:
@@ -98,12 +108,26 @@ def append_rows(path, rows):
                 writer.writeheader()
             elif not before.endswith(b"\n"):
                 text.write("\n")  # ends a line that was cut off
-            writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v
-                              for k, v in row.items()} for row in rows)
+            writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else json.dumps(v) if
+                              k in LISTS else v for k, v in row.items()} for row in rows)
             file.write(text.getvalue().encode())
     except OSError as error:
         raise fac.UserError(f"{path}: can't be written: {error.strerror}; the same command makes "
                             "what is missing") from None
+
+
+def lock(path):
+    """A CSV that one command has until it closes this, or ends; UserError if another has it."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = open(path, "ab")
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise fac.UserError(f"{path}: another command is at its runs; wait for its end, or choose "
+                            "another --out") from None
+    except OSError as error:
+        raise fac.UserError(f"{path}: can't be written: {error.strerror}") from None
+    return file
 
 
 def finished(rows):
@@ -118,6 +142,7 @@ def attempt(function, run, home):
     """A run's rows; one that fails is a row with its error. home: the process that waits."""
     if home != os.getpid():
         os.environ["TQDM_DISABLE"] = "1"  # a worker's own bars
+        multiprocessing.set_start_method("spawn", force=True)  # loky's can't start a run's workers
         if os.getppid() == home and sys.platform == "linux":  # ends with it
             ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG, SIGKILL
     began = time.time()
@@ -133,7 +158,16 @@ def attempt(function, run, home):
             found[-1].setdefault("minutes", (time.time() - began) / 60)
         except Exception as error:
             return failed(run, error)
-    return [{**run, **row} for row in found]
+    return [{**run, **row, "versions": versions()} for row in found]
+
+
+def versions():
+    """What returns depend on beside a run's settings: a package's name and version each."""
+    found = []
+    for name in ("numpy", "mujoco", "fac-tdmpc-ref"):
+        with contextlib.suppress(metadata.PackageNotFoundError):  # a clone that isn't installed
+            found.append(f"{name} {metadata.version(name)}")
+    return ", ".join(found)
 
 
 def failed(run, error):
@@ -196,20 +230,22 @@ def run_all(args, function, runs):
     for task in args.tasks:
         fac.lookup_task(task)
     path, errors = Path(args.out or RESULTS / f"{args.command}.csv"), []
-    done, runs = finished(read_rows(path)), unique(runs)
-    todo = [run for run in runs if key_of(run) not in done]
+    runs, keys = unique(runs), [*finished(read_rows(path))]
     if args.command in REPORTS:
-        one_figure(path, [*(key for key in done if key[0] in args.tasks), *map(key_of, todo)],
+        one_figure(path, [*(key for key in keys if key[0] in args.tasks), *map(key_of, runs)],
                    VARIED.get(args.command, ()))
-    address = getattr(args, "scheduler", None)
-    ended = (on_cluster(function, todo, connect(address)) if address else
-             in_processes(function, todo, min(args.jobs, len(todo))))
-    append_rows(path, [])  # what can't be written is missed now
-    with fac.progress(args.command, len(runs), "run", len(runs) - len(todo)) as bar:
-        for rows in ended:
-            append_rows(path, rows)
-            errors += [row["error"] for row in rows if row.get("error")]
-            bar.update()
+    client = connect(args.scheduler) if getattr(args, "scheduler", None) else None
+    with lock(path):
+        done = finished(read_rows(path))  # by whoever had it before, too
+        todo = [run for run in runs if key_of(run) not in done]
+        ended = (on_cluster(function, todo, client) if client else
+                 in_processes(function, todo, min(args.jobs, len(todo))))
+        append_rows(path, [])  # its head: what can't be written is missed now
+        with fac.progress(args.command, len(runs), "run", len(runs) - len(todo)) as bar:
+            for rows in ended:
+                append_rows(path, rows)
+                errors += [row["error"] for row in rows if row.get("error")]
+                bar.update()
     for error in errors:
         print(f"failed: {error}", file=sys.stderr)
     print(f"{path}: {len(runs)} runs, {len(todo)} of them now, {len(errors)} failed")
@@ -224,10 +260,8 @@ def planning_for(header, about):
 
 def measure(model, task, planning, count, environment=None):
     """A row's columns of the returns of `count` episodes of evaluation seed 0, in this process."""
-    returns = fac.play(model, task, planning, fac.episode_seeds(0, count), 0, "evaluating",
-                       environment)[2].sum(1)
-    return {"return_mean": float(returns.mean()), "return_std": float(returns.std()),
-            "return_min": float(returns.min())}
+    return of_returns(fac.play(model, task, planning, fac.episode_seeds(0, count), 0, "evaluating",
+                               environment)[2].sum(1), 0)
 
 
 # ------------------------------------------------- Figures 4, 5, 13 and sweeps: distillation
@@ -337,11 +371,22 @@ def command_departures(args):
     return distil_all(args, lambda task: cases.items())
 
 
+def command_students(args):
+    """students: what `distill` makes by default, for the README's main table."""
+    preset = fac.paper_preset if args.preset == "paper" else lambda config: {}
+    defaults = {"steps": fac.DistillConfig(**preset(fac.DistillConfig)).steps,
+                **vars(fac.PlannerConfig(**preset(fac.PlannerConfig)))}
+    about = {k: getattr(args, k) or defaults[k] for k in ("steps", "samples", "iterations")}
+    data = {task: data_checksums(task) for task in args.tasks}
+    return run_all(args, functools.partial(students.distil_student, students=args.students), [
+        make_run(task, seed, args.preset, data=data[task], episodes=args.episodes,
+                 num_agents=fac.lookup_task(task)[3], **about)
+        for seed, task in itertools.product(args.seeds, args.tasks)])
+
+
 def command_sweep(args):
     """sweep: a grid of distill's settings."""
     known, grid = {f.name: f for f in dataclasses.fields(fac.DistillConfig)}, []
-    fac.need((args.backend == "dask") == bool(args.scheduler),
-             "--backend dask and --scheduler tcp://HOST:PORT need each other")
     for text in args.set:
         name, equals, values = text.partition("=")
         name = name.replace("-", "_")
@@ -364,7 +409,6 @@ def command_sweep(args):
 # ------------------------------------------------------------ Figures 7 and 8: planning
 
 BUDGETS = [(s, i) for s in (512, 256, 128, 64, 32, 16) for i in (6, 4, 2, 1)]
-KEEPS = 0.95  # of the full budget's return: what is still as good
 
 
 def load(task, seed, case, students):
@@ -411,6 +455,9 @@ def plan_with(task, seed, case, settings, students):
     yield measure(model, task, planning, settings["episodes"], environment)
 
 
+KINDS = ("noise", "0.5", "1.5")  # an action is noise; its motor's strength
+
+
 class DisturbedEnvironment(fac.Environment):
     """A task whose robot isn't the planner's: one action is noise, or its motor another."""
 
@@ -439,15 +486,16 @@ def command_figure7(args):
 
 def time_all(args, result, runs, opened):
     """Add rows with milliseconds of the runs that have none. opened(run): (model, header)."""
-    timed = {key_of(row) for row in read_rows(result["out"]) if row["ms"]}
-    groups = {}  # of one budget, which take turns
-    for run in unique(runs):
-        if key_of(run) not in timed:
-            about = json.loads(run["settings"])
-            groups.setdefault((run["task"], about.get("samples"), about.get("iterations")),
-                              []).append(run)
-    for todo in groups.values():
-        append_rows(Path(result["out"]), time_runs(todo, opened, args.rounds))
+    path, groups = Path(result["out"]), {}  # of one budget, which take turns
+    with lock(path):
+        timed = {key_of(row) for row in read_rows(path) if row["ms"]}
+        for run in unique(runs):
+            if key_of(run) not in timed:
+                about = json.loads(run["settings"])
+                groups.setdefault((run["task"], about.get("samples"), about.get("iterations")),
+                                  []).append(run)
+        for todo in groups.values():
+            append_rows(path, time_runs(todo, opened, args.rounds))
     return result
 
 
@@ -475,7 +523,7 @@ def command_figure8(args):
     def variants(task):
         joints = range(fac.lookup_task(task)[3])
         return [{}, *({"joint": j, "kind": kind} for j in joints
-                      for kind in ("noise", "0.5", "1.5"))]
+                      for kind in KINDS)]
     return run_all(args, functools.partial(plan_with, students=args.students),
                    planning_runs(args, variants))
 
@@ -531,7 +579,8 @@ AUTHORS = {
     "humanoid-walk": (789, 724, 458, 227)}
 CASES = [*FIGURE4, *FIGURE5_CASES]
 BUDGET = ("data", "steps", "evaluations", "episodes", "samples", "iterations", "decisions")
-VARIED = {"figure7": ("samples", "iterations"), "figure8": ("joint", "kind")}
+VARIED = {"figure7": ("samples", "iterations"), "figure8": ("joint", "kind"),
+          "students": ("samples", "iterations")}
 
 
 def one_figure(path, keys, varied):
@@ -553,6 +602,10 @@ def one_figure(path, keys, varied):
 def settled(path, varied=()):
     """A CSV's finished runs, of one figure; without seeds that lack some of what is varied."""
     rows = finished(read_rows(path))
+    old = {row["versions"] for own in rows.values() for row in own if row["return_mean"]}
+    if old - {versions()}:
+        others = " and ".join(sorted(of or "versions that it doesn't name" for of in old))
+        print(f"{path}: returns of {others}; now {versions()}", file=sys.stderr)
     for task, budget in one_figure(path, rows, varied).items():
         with contextlib.suppress(fac.UserError):  # its data may not be here
             if budget["data"] != made_from(task, budget):
@@ -577,48 +630,6 @@ def curves(rows, column="return_mean"):
     return found
 
 
-def last(curve, ranks):
-    """Mean and deviation over seeds, and their number, where a curve ends; the rank correlation
-    of G there, if it was measured."""
-    values = curve[max(curve)]
-    found = {"mean": float(np.mean(values)), "std": float(np.std(values)), "seeds": len(values)}
-    return {**found, "rank_return": float(np.mean(ranks[max(ranks)]))} if ranks else found
-
-
-def draw_lines(path, panels, xlabel, **axes):
-    """A panel each {title: ({label: {x: [values]}}, level or None)}: mean and band over seeds;
-    the level, an expert's, is a line across."""
-    plt = fac.pyplot()
-    labels = list(dict.fromkeys(label for lines, _ in panels.values() for label in lines))
-    cycle, columns = list(plt.rcParams["axes.prop_cycle"]), min(4, len(panels))
-    figure, grid = plt.subplots(-(-len(panels) // columns), columns, squeeze=False,
-                                figsize=(3.6 * columns, 3.8 * -(-len(panels) // columns)),
-                                layout="constrained")
-    for ax, (title, (lines, level)) in itertools.zip_longest(grid.flat, panels.items(),
-                                                             fillvalue=(None, (None, None))):
-        if lines is None:
-            ax.remove()
-            continue
-        order = labels if len(labels) <= len(cycle) else list(lines)  # one style, one line
-        for label, points in lines.items():
-            style = cycle[order.index(label) % len(cycle)]
-            x = sorted(points)
-            mean, std = (np.array([f(points[v]) for v in x]) for f in (np.mean, np.std))
-            ax.plot(x, mean, marker=".", label=label, **style)
-            ax.fill_between(x, mean - std, mean + std, color=style["color"], alpha=0.15)
-        if level is not None:
-            ax.axhline(level, color="black", linewidth=0.8, linestyle=(0, (1, 3)), label="expert")
-        ax.set(title=title, xlabel=xlabel, ylabel="episode return",
-               ylim=(0, 1.05 * ax.get_ylim()[1]), **axes)
-        if axes:  # logarithmic: a tick for each point
-            ax.set_xticks(x := sorted(set().union(*lines.values())), [f"{v:.0f}" for v in x])
-            ax.minorticks_off()
-        else:
-            ax.locator_params("x", nbins=5)
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, fontsize=8)
-    fac.save_figure(path, figure)
-
-
 def expert_level(task, rows):
     """The mean of an expert's recorded returns, planned as the runs were; None: no record."""
     about = next((json.loads(settings) for own, _, _, settings in rows if own == task), {})
@@ -628,22 +639,6 @@ def expert_level(task, rows):
     key = fac.record_key(expert, planning_for(header, about), 0)
     returns, _ = fac.read_records(path).get(key, ([], {}))
     return float(np.mean(returns[:about.get("episodes")])) if returns else None
-
-
-def markdown(heads, rows):
-    """A Markdown table."""
-    return "\n".join("| " + " | ".join(map(str, row)) + " |" for row in (
-        heads, ["---"] * len(heads), *rows)) + "\n"
-
-
-def cell(found):
-    """mean ± deviation over seeds, if there are several (their number), rank correlation of G."""
-    if not found:
-        return "-"
-    rank = f", {found['rank_return']:.2f}" if "rank_return" in found else ""
-    spread = f" ± {found['std']:.0f} ({found['seeds']})" if found["seeds"] > 1 else ""
-    ms = f", {found['ms']:.1f} / {found['ms_workers']:.1f} ms" if "ms" in found else ""
-    return f"{found['mean']:.0f}{spread}{rank}{ms}"
 
 
 def report_curves(name, path, figures):
@@ -689,111 +684,108 @@ def report_curves(name, path, figures):
 
 
 def follow_up(rows, task):
-    """Figure 12 in numbers: final return of the student over the expert's, mean over seeds; lags
-    to 50, 75 and 90% of each seed."""
+    """Figure 12 in numbers: the mean final return of students over that of experts; lags to 50, 75
+    and 90% of each seed."""
     from train_expert import lag
     runs = [[{"decisions": int(r["step"]), "eval_student": float(r["return_mean"]),
               "eval_expert": float(r["expert_mean"])} for r in own if r["step"]]
             for (t, *_), own in rows.items() if t == task]
-    ratios = [fac.return_kept(run[-1]["eval_student"], run[-1]["eval_expert"]) for run in runs]
-    return (float(np.mean(ratios)) if None not in ratios else None,
-            [[lag(run, p) for p in (0.5, 0.75, 0.9)] for run in runs])
+    ends = [np.mean([run[-1][key] for run in runs]) for key in ("eval_student", "eval_expert")]
+    return fac.return_kept(*ends), [[lag(run, p) for p in (0.5, 0.75, 0.9)] for run in runs]
 
 
 def report_figure7(_, path, figures):
-    """Figure 7: the smallest budget, by milliseconds, that keeps 0.95 of the full one's return."""
-    rows, cells = settled(path, VARIED["figure7"]), {}
+    """Figure 7: the cheapest budgets that keep 0.95 of what each model gets with the full one, and,
+    at equal return, of the lower of both; chosen by every other episode, reported on the rest."""
+    rows, cells, split = settled(path, VARIED["figure7"]), {}, set()
     for (task, _, case, settings), own in rows.items():
         about = json.loads(settings)
         into = cells.setdefault(task, {}).setdefault(case, {}).setdefault(
-            (about["samples"], about["iterations"]), {"return": [], "ms": [], "ms_workers": []})
+            (about["samples"], about["iterations"]),
+            {"chosen_by": [], "return": [], "all": [], "ms": [], "ms_workers": []})
         for row in own:
-            for key in into:
-                value = row["return_mean" if key == "return" else key]
-                into[key] += [float(value)] if value else []
+            if row["return_mean"]:
+                found = (*halves(row), float(row["return_mean"]))
+                split.add(bool(row["returns"]))
+                for key, value in zip(("chosen_by", "return", "all"), found):
+                    into[key].append(value)
+            for key in ("ms", "ms_workers"):
+                into[key] += [float(row[key])] if row[key] else []
     panels, result, table = {}, [], []
     for task, cases in cells.items():
         for axis, other, name in ((0, 6, "samples x 6"), (1, 512, "512 x iterations")):
             panels[f"{task}: {name}"] = ({
-                case: {budget[axis]: about["return"] for budget, about in budgets.items()
+                case: {budget[axis]: about["all"] for budget, about in budgets.items()
                        if budget[1 - axis] == other} for case, budgets in cases.items()}, None)
-        least = {}
-        for case, budgets in cases.items():
-            full = np.mean(budgets.get((512, 6), {"return": [np.nan]})["return"])
-            good = {budget: about for budget, about in budgets.items()
-                    if np.mean(about["return"]) >= KEEPS * full}
-            for key in ("ms", "ms_workers") if case == "student" else ("ms",):
-                if good and all(about[key] for about in good.values()):  # all are timed
-                    best = min(good, key=lambda b: np.mean(good[b][key]))  # noqa: B023
-                    least[case, key] = {"samples": best[0], "iterations": best[1],
-                                        "ms": float(np.mean(good[best][key]))}
-        if len(least) == 3:
-            expert, alone, parallel = (least[k] for k in (("expert", "ms"), ("student", "ms"),
-                                                          ("student", "ms_workers")))
-            row = {"task": task, "expert": expert, "student": min(
-                alone, parallel, key=lambda x: x["ms"]), "student_in_process": alone,
-                "student_workers": parallel}
-            row["ratio"] = expert["ms"] / row["student"]["ms"]
-            row["ratio_in_process"] = expert["ms"] / alone["ms"]
+        row = budgets_of(task, cases)
+        if row:
             result.append(row)
-            table.append((task, *(f"{x['samples']} x {x['iterations']}: {x['ms']:.1f} ms"
-                                  for x in (expert, alone, parallel)), f"{row['ratio']:.1f}"))
+            table.append(budget_cells(row))
     draw_lines(figures / "figure7.png", panels, "samples or iterations", xscale="log")
-    return result, markdown(("", "expert", "student, one process", "student, workers", "ratio"),
-                            table)
+    note = ("Budgets are chosen by every other episode; returns are of the others."
+            if split == {True} else "Some rows hold no episode's return: there the budgets are "
+            "chosen by the episodes that they are reported on.")
+    return result, markdown(
+        ("", *(f"{at}: {of}" for at in ("equal return", "0.95 of its own") for of in (
+            "expert", "student, one process", "with workers", "speed-up, one process / best")),
+         "kept, 512 x 6 / 128 x 4", "128 x 4: speed-up, one process / best"), table
+    ) + f"\n{note}\n"
 
 
 def report_figure8(_, path, figures):
-    """Figure 8: bars of the return with each action dimension disturbed; means over these."""
-    rows, cells = settled(path, VARIED["figure8"]), {}
+    """Figure 8: bars of the return with each action dimension disturbed; means over these, and the
+    difference of what is kept, with its interval."""
+    rows, measured = settled(path, VARIED["figure8"]), defaultdict(dict)
     for (task, _, case, settings), own in rows.items():
         about = json.loads(settings)
-        cells.setdefault(task, {}).setdefault(case, {}).setdefault(
+        measured[task].setdefault(case, {}).setdefault(
             (about.get("kind", "none"), about.get("joint", 0)), []).append(
-            float(next(row["return_mean"] for row in reversed(own) if row["return_mean"])))
-    plt, kinds = fac.pyplot(), ("noise", "0.5", "1.5")
-    figure, grid = plt.subplots(len(cells), 3, squeeze=False, layout="constrained",
-                                figsize=(11, 2.8 * len(cells)), sharey="row")
+            next(row for row in reversed(own) if row["return_mean"]))
+    cells = {task: {case: {key: [float(row["return_mean"]) for row in found]
+                           for key, found in values.items()} for case, values in cases.items()}
+             for task, cases in measured.items()}
+    draw_bars(figures / "figure8.png", cells, KINDS)
     result, table = {}, []
-    for row, (task, cases) in zip(grid, cells.items()):
-        actions = fac.lookup_task(task)[3]
-        for ax, kind in zip(row, kinds):
-            for i, (case, values) in enumerate(sorted(cases.items())):
-                joints = sorted(j for k, j in values if k == kind)
-                ax.bar(np.array(joints) + 0.4 * i - 0.2,
-                       [np.mean(values[kind, j]) for j in joints], 0.38, label=case,
-                       color=f"C{i}", hatch=("", "//")[i % 2], edgecolor="black")
-                if ("none", 0) in values:
-                    ax.axhline(np.mean(values["none", 0]), color=f"C{i}", linestyle=("-", "--")[i])
-            what = "one action is noise" if kind == "noise" else f"one motor x {kind}"
-            ax.set(title=f"{task}: {what}", xlabel="action dimension", ylabel="episode return",
-                   xticks=range(0, actions, 1 + actions // 20))
+    for task, cases in cells.items():
         both = set.intersection(*(set(values) for values in cases.values()))  # measured for all
-        result[task] = {case: {kind: float(np.mean([np.mean(values[k, j]) for k, j in both
-                                                    if k == kind]))
-                               for kind in ("none", *kinds) if kind in dict(both)}
+        joints = {kind: sorted(j for k, j in both if k == kind) for kind in ("none", *KINDS)}
+        result[task] = {case: {kind: float(np.mean([np.mean(values[kind, j]) for j in found]))
+                               for kind, found in joints.items() if found}
                         for case, values in cases.items()}
-        table += [(task, case, *(f"{found[kind]:.0f}" if kind in found else "-"
-                                 for kind in ("none", *kinds)))
+        table += [(task, case, *(f"{found[kind]:.0f}" if kind in found else "-" for kind in joints))
                   for case, found in sorted(result[task].items())]
-    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    fac.save_figure(figures / "figure8.png", figure)
-    return result, markdown(("", "", "undisturbed", *kinds), table)
+        if {"expert", "student"} <= set(cases) and joints.pop("none"):
+            found = {kind: kept_difference(measured[task]["student"], measured[task]["expert"],
+                                           kind, own) for kind, own in joints.items() if own}
+            result[task]["kept"] = found
+            table.append((task, "kept: student / expert, difference", "",
+                          *(kept_cell(found.get(kind)) for kind in KINDS)))
+    return result, markdown(("", "", "undisturbed", *KINDS), table)
+
+
+def report_students(_, path, figures):
+    """The README's main table: students as `distill` makes them."""
+    rows = [row for own in settled(path, VARIED["students"]).values() for row in own]
+    theirs = {task: f"{found[1]} / {found[0]}" for task, found in AUTHORS.items()}
+    return students.table(rows, theirs)
 
 
 REPORT_HEAD = """# The paper's figures, here
 
 Written by `python data/experiments.py report` from the CSVs beside it; README.md says what they
-show. Returns: mean ± deviation over seeds (their number; one without), then the rank correlation of
-G; every run's settings are in its CSV. '10% TD-MPC' has hidden layers of 66 (B.2), which with
-Table 2's latents of 50 is 3% of the weights behind the encoder; six agents have 26%. One agent has
-layers of 512, the experts of hopper, fish, quadruped and humanoid of 256. Figure 13: latents of 50
-an agent, so 50 N in all.
+show. Returns: mean ± sample deviation (n - 1) over seeds (their number; one without), then the rank
+correlation of G; every run's settings are in its CSV. Figure 12's ratio is one of means. In Figure
+8 what is kept is of the undisturbed return, mean over joints, with where 95% of a bootstrap over
+episodes and joints lie, bold without 0 in it; where a row holds no episode's return, its mean has
+the luck that its deviation allows, the same for all joints of a model. '10% TD-MPC' has hidden
+layers of 66 (B.2), which with Table 2's latents of 50 is 3% of the weights behind the encoder; six
+agents have 26%. One agent has layers of 512, the experts of hopper, fish, quadruped and humanoid of
+256. Figure 13: latents of 50 an agent, so 50 N in all.
 
 """
-REPORTS = {"figure4": report_curves, "figure5": report_curves, "figure7": report_figure7,
-           "figure8": report_figure8, "figure12": report_curves, "figure13": report_curves,
-           "departures": report_curves}
+REPORTS = {"students": report_students, "figure4": report_curves, "figure5": report_curves,
+           "figure7": report_figure7, "figure8": report_figure8, "figure12": report_curves,
+           "figure13": report_curves, "departures": report_curves}
 
 
 def command_report(args):
@@ -808,7 +800,8 @@ def command_report(args):
             except (LookupError, ValueError, TypeError, StopIteration) as odd:
                 raise fac.UserError(f"{results / name}.csv: not {name}'s rows ({odd!r})") from None
             title = name.replace("figure", "Figure ").capitalize()
-            text.append(f"## {title}\n\n{table}\n![]({figures_from}/{name}.png)\n")
+            picture = f"![]({figures_from}/{name}.png)\n" if name != "students" else ""
+            text.append(f"## {title}\n\n{table}\n{picture}")
     fac.need(result, f"{results}: no runs there; make some, e.g. with 'experiments.py figure4'")
     with fac.atomic_file(results / "report.md", "w", encoding="utf-8") as file:
         file.write(REPORT_HEAD + "\n".join(text))
@@ -867,6 +860,14 @@ def make_parser():
              "half or one and a half times as strong.", 5)):
         sub = add_runs(name, run, help, walkers, episodes=episodes)
         sub.add_argument("--students", default="runs", help="where distill left TASK-SEED/ [runs]")
+    sub = add_runs("students", command_students, "Students as distill makes them by default, for "
+                   "the README's main table: evaluation seeds 0 and 1, and the expert's policy "
+                   "alone.", shipped, episodes=20)
+    sub.add_argument("--students", default="runs", help="leave them in TASK-SEED/ there [runs]")
+    sub.add_argument("--preset", choices=("default", "paper"), default="default",
+                     help="distill's: a column of the table for each [default]")
+    for name in ("steps", "samples", "iterations"):
+        sub.add_argument(f"--{name}", type=positive, help="distill's [the preset's]")
     sub = add_runs("figure12", command_figure12, "Appendix C.1: an expert that learns and a "
                    "student that follows it.", ["reacher-easy", "walker-walk", "cheetah-run"],
                    episodes=10)
@@ -880,10 +881,9 @@ def make_parser():
                    ["reacher-hard"], steps=fac.DistillConfig.steps, evaluations=1, episodes=10)
     sub.add_argument("--set", nargs="+", action="extend", required=True, metavar="NAME=VALUE,...",
                      help="e.g. lr=1e-3,3e-4 batch-size=16,32; Algorithm 1's in distill --help")
-    sub.add_argument("--backend", choices=("loky", "dask"), default="loky", help="processes of "
-                     "this machine, or a cluster whose scheduler and workers (--nthreads 1) have "
-                     "this repository and its data/ on their PYTHONPATH [loky]")
-    sub.add_argument("--scheduler", help="dask's, tcp://HOST:PORT")
+    sub.add_argument("--scheduler", metavar="tcp://HOST:PORT", help="a dask cluster's, which makes "
+                     "the runs; it and its workers (--nthreads 1) have this repository and its "
+                     "data/ on their PYTHONPATH [none: processes of this machine]")
     sub = fac.add_command(commands, "report", command_report, "Tables and figures from the CSVs: "
                           "data/results/report.md, data/figures/figure*.png.")
     sub.add_argument("--results", default=RESULTS, help="where the CSVs are [data/results]")

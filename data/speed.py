@@ -213,9 +213,10 @@ def print_benchmark(result, robots):
     ratio = {(r["robot"], r["function"], r["mode"]): r for r in result["speedup"]}
     columns = [(m, "one-thread") for m in ("TD-MPC", "10% TD-MPC", "TAP", "Fac-TDMPC")]
     columns += [("Fac-TDMPC", mode) for mode in MODES[1:]]
-    print(f"\nPrediction, ms, batch {TABLE3_BATCH}, mean ± sd; x: TD-MPC's time over Fac-TDMPC's, "
-          f"one thread / processes / one agent alone (paper: N threads); TAP: TD-MPC's networks on "
-          f"two latent actions\n")
+    print(f"\nPrediction, ms, batch {TABLE3_BATCH}, mean ± sd of timings; x: TD-MPC's time over "
+          f"Fac-TDMPC's, one thread / processes / one agent alone (paper: N threads), both of "
+          f"section 5.1's sizes (layers and latents 512 wide, agents' 512 // N), which experts and "
+          f"students that are shipped don't have; TAP: TD-MPC's networks on two latent actions\n")
     heads = [m if mode == "one-thread" else mode for m, mode in columns]
     fac.print_table([("", "", *heads, "x", "paper's x")] + [
         (robot, f, *(times[(robot, f, *column)] for column in columns),

@@ -19,6 +19,8 @@ import experiments
 import fac_tdmpc_ref as fac
 import look
 import speed
+import students
+import tables
 import test_cli
 import test_distill
 import train_expert
@@ -91,7 +93,8 @@ def test_table3_measures_every_mode(tmp_path):
     times = [decisions["hopper", m, "section51", "one-thread", 16, 1]["ms_median"]
              for m in ("TD-MPC", "Fac-TDMPC")]
     assert row["paper"] is None and np.isclose(row["value"], times[0] / times[1])
-    for part in ("hopper", "critical-path", "paper's x", "16 x 1", "hand-over"):
+    for part in ("hopper", "critical-path", "paper's x", "section 5.1's sizes", "16 x 1",
+                 "hand-over"):
         assert part in done.stdout
     assert os.listdir(tmp_path) == ["figure6.png"] * ("--figure" in flags)
     if "--figure" in flags:
@@ -121,7 +124,7 @@ def test_help_teaches():
     parser = experiments.make_parser()
     (commands,) = (a.choices for a in parser._actions if isinstance(a.choices, dict))
     assert set(commands) == {"table3", "figure4", "figure5", "figure6", "figure7", "figure8",
-                             "figure9", "figure12", "figure13", "departures", "sweep",
+                             "figure9", "figure12", "figure13", "departures", "sweep", "students",
                              "agreement", "watch", "report"}
     assert commands.pop("figure6") is commands["table3"]
     assert all(name in parser.format_help() for name in commands)
@@ -129,7 +132,7 @@ def test_help_teaches():
         assert f"experiments.py {name}" in command.format_help()
         without = {action.dest for action in command._actions
                    if not (action.required or action.nargs == 0 or "[" in action.help)}
-        assert without <= {"beside", "figure", "workers", "scheduler"}
+        assert without <= {"beside", "figure", "workers"}
 
 
 # runs ---------------------------------------------------------------------------------
@@ -153,7 +156,8 @@ def test_a_killed_sweep_goes_on_and_makes_no_run_twice(tmp_path):
     path, begun = tmp_path / "sweep.csv", time.time()
     while not rows_of(path) and time.time() - begun < 100:
         time.sleep(0.05)
-    process.kill()
+    refused(run(*flags, cwd=tmp_path), "sweep.csv: another command is at its runs", "--out")
+    process.kill()  # which leaves no lock
     process.wait()
     before = rows_of(path)
     assert 1 <= len(before) < 5
@@ -201,6 +205,20 @@ def test_a_run_whose_process_dies_is_a_row_and_stops_nothing(jobs, capfd):
     assert capfd.readouterr().out == ""  # the last line is the command's own
 
 
+def test_a_run_may_have_workers_of_its_own():
+    pytest.importorskip("joblib")
+
+    def function(task, seed, case, settings):
+        expert, _ = fac.load_model(fac.data_file(task, "expert.npz"))
+        sizes = fac.student_config(expert.config, 2, "table2", "expert")
+        student = fac.new_student(expert, sizes, 0)[1]
+        with fac.Planner(student, fac.PlannerConfig(samples=4, iterations=1), workers=1) as planner:
+            yield {"return_mean": float(np.abs(planner.act(np.zeros(17))).max())}
+
+    ((row,),) = experiments.in_processes(function, [experiments.make_run("cheetah-run", 0, "x")], 1)
+    assert 0 < row["return_mean"] <= 1
+
+
 def test_a_run_without_a_finite_return_has_failed():
     run = experiments.make_run("cheetah-run", 0, "x")
     (row,) = experiments.attempt(lambda *_: [{"return_mean": float("nan")}], run, os.getpid())
@@ -217,7 +235,8 @@ def test_a_run_that_does_not_fit_its_figure_is_refused_before_the_work(tmp_path)
 
 
 @pytest.mark.parametrize("column, value", [
-    ("return_mean", "nan"), ("step", "x"), ("settings", "[]"), ("settings", "{")])
+    ("return_mean", "nan"), ("step", "x"), ("settings", "[]"), ("settings", "{"),
+    ("evaluation_seed", "x"), ("returns", 5.0), ("ranks", "[0.5")])
 def test_a_damaged_row_is_shown(tmp_path, column, value):
     row = {**experiments.make_run("walker-run", 0, "TAP"), "step": 1, "return_mean": 2.0,
            "minutes": 1.0}
@@ -226,6 +245,18 @@ def test_a_damaged_row_is_shown(tmp_path, column, value):
     experiments.append_rows(tmp_path / "figure4.csv", [{**row, column: value}])
     with pytest.raises(fac.UserError, match=r"figure4.csv: .*TAP.*delete the line"):
         experiments.read_rows(tmp_path / "figure4.csv")
+
+
+def test_a_csv_is_one_command_s_until_it_ends(tmp_path):
+    path = tmp_path / "new" / "7.csv"
+    with experiments.lock(path):
+        with pytest.raises(fac.UserError, match="7.csv: another command is at its runs"):
+            experiments.lock(path)
+        with pytest.raises(fac.UserError, match="another command"):  # which adds milliseconds
+            experiments.time_all(None, {"out": str(path)}, [], None)
+        experiments.append_rows(path, [{**experiments.make_run("x", 0, "y"), "minutes": 1.0}])
+        assert len(experiments.read_rows(path)) == 1
+    experiments.lock(path).close()
 
 
 def test_workers_end_with_the_process_that_waits_for_them(tmp_path):
@@ -271,8 +302,8 @@ def test_dask_gives_the_rows_that_processes_give(tmp_path, monkeypatch):
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1,
                                   dashboard_address=None) as cluster:
         address = cluster.scheduler_address
-        last_json(run(*flags, "--out", "dask.csv", "--backend", "dask", "--scheduler", address,
-                      "--json", cwd=tmp_path))
+        last_json(run(*flags, "--out", "dask.csv", "--scheduler", address, "--json",
+                      cwd=tmp_path))
         cluster.scheduler.allowed_failures = 0
         function, runs = seven_but_one_dies()
         ((row,),) = experiments.on_cluster(function, runs[1:2], experiments.connect(address))
@@ -289,10 +320,9 @@ def test_dask_gives_the_rows_that_processes_give(tmp_path, monkeypatch):
     (["figure6", "--out", "x.csv"], ["unrecognized", "--out"]),
     (["sweep", "--set", "kl=sideways"], ["kl", "sideways"]),
     (["sweep", "--set", "num-agents=3,7"], ["num_agents", "[1, 3]", "not 7"]),
-    (["sweep", "--set", "lr=1e-3", "--backend", "dask"], ["--scheduler"]),
-    (["sweep", "--set", "lr=1e-3", "--scheduler", "tcp://host:1"], ["--backend dask"]),
-    (["sweep", "--set", "lr=1e-3", "--backend", "dask", "--scheduler", "nowhere"], ["nowhere"]),
-    (["sweep", "--set", "lr=1e-3", "--backend", "dask", "--scheduler", "tls://host:1"], ["tls"]),
+    (["sweep", "--set", "lr=1e-3", "--scheduler"], ["--scheduler"]),
+    (["sweep", "--set", "lr=1e-3", "--scheduler", "nowhere"], ["nowhere"]),
+    (["sweep", "--set", "lr=1e-3", "--scheduler", "tls://host:1"], ["tls"]),
     (["figure4", "--tasks", "reecher-hard"], ["reecher-hard", "reacher-hard"]),
     (["figure5", "--jobs", "0"], ["--jobs"]),
     (["figure7", "--tasks", "walker-run", "--seeds", "7"], ["walker-run-7", "distill"]),
@@ -300,6 +330,7 @@ def test_dask_gives_the_rows_that_processes_give(tmp_path, monkeypatch):
 def test_bad_runs_are_refused(tmp_path, flags, parts):
     pytest.importorskip("joblib")
     pytest.importorskip("matplotlib")
+    pytest.importorskip("distributed" if flags[-1] in ("nowhere", "tls://host:1") else "joblib")
     before = sorted(experiments.RESULTS.iterdir())
     refused(run(*flags, cwd=tmp_path), *parts)
     assert sorted(experiments.RESULTS.iterdir()) == before  # the default --out
@@ -760,18 +791,94 @@ def test_figure_7_judges_means_and_draws_along_its_axes(tmp_path, monkeypatch):
     write_rows(tmp_path / "7.csv", [("walker-run", seed, case, {"samples": s, "iterations": i}, [
         {"return_mean": value[seed], "minutes": 1.0}, {"ms": ms, "ms_workers": ms}])
         for seed in (0, 1) for case in ("expert", "student") for s, i, value, ms in found])
-    (row,), _ = experiments.report_figure7("", tmp_path / "7.csv", tmp_path)
-    assert row["expert"] == {"samples": 512, "iterations": 2, "ms": 6}
+    (row,), table = experiments.report_figure7("", tmp_path / "7.csv", tmp_path)
+    assert row["expert"] == {"samples": 512, "iterations": 2, "ms": 6, "return": 96}
     assert [set(lines["expert"]) for lines, _ in drawn.values()] == [{512, 64}, {6, 2}]
+    assert "chosen by the episodes that they are reported on" in table
+
+
+def test_figure_7_compares_at_equal_return_on_episodes_that_chose_nothing(tmp_path, monkeypatch):
+    """The student's full return is 60: the expert reaches 0.95 of it in a millisecond, of its own
+    in ten. A budget that only the reporting episodes favour isn't chosen."""
+    monkeypatch.setattr(experiments, "draw_lines", lambda *_, **__: None)
+    found = {"expert": {(512, 6): ([100, 102] * 2, 20.0), (128, 4): ([97, 75] * 2, 10.0),
+                        (16, 1): ([60, 66] * 2, 1.0)},
+             "student": {(512, 6): ([60, 50] * 2, 8.0), (128, 4): ([60, 48] * 2, 5.0),
+                         (64, 1): ([57, 33] * 2, 2.0), (16, 1): ([56, 90] * 2, 0.5)}}
+    write_rows(tmp_path / "7.csv", [("walker-run", 0, case, {"samples": s, "iterations": i}, [
+        {"return_mean": np.mean(returns), "returns": returns, "minutes": 1.0},
+        {"ms": ms, "ms_workers": 2 * ms}])
+        for case, budgets in found.items() for (s, i), (returns, ms) in budgets.items()])
+    (row,), table = experiments.report_figure7("", tmp_path / "7.csv", tmp_path)
+    assert row["expert"] == {"samples": 128, "iterations": 4, "ms": 10.0, "return": 75.0}
+    equal = row["equal_return"]
+    assert equal["expert"] == {"samples": 16, "iterations": 1, "ms": 1.0, "return": 66.0}
+    assert equal["student"] == {"samples": 64, "iterations": 1, "ms": 2.0, "return": 33.0}
+    assert (row["ratio"], equal["ratio"]) == (5.0, 0.5)
+    assert row["kept"] == {"512 x 6": 55 / 101, "128 x 4": 54 / 86}
+    assert row["speedup"] == {"512 x 6": [2.5, 2.5], "128 x 4": [2.0, 2.0]}
+    assert "16 x 1: 66, 1.0 ms | 64 x 1: 33, 2.0 ms" in table and "every other episode" in table
+
+
+def figure8_rows(returns, keep_each=True):
+    """{(kind, joint): rows} of {(kind, joint): episodes' returns}, as a CSV holds them."""
+    return {key: [{"returns": json.dumps(own) if keep_each else "", "return_mean": np.mean(own),
+                   "return_std": np.std(own), "settings": json.dumps({"episodes": len(own)})}]
+            for key, own in returns.items()}
+
+
+def test_an_interval_is_as_wide_as_episodes_and_joints_scatter():
+    def kept(student, expert, keep_each=True):
+        return tables.kept_difference(*(figure8_rows(found, keep_each)
+                                        for found in (student, expert)), "noise", [0, 1])
+
+    steady = {("none", 0): [100.0] * 5, ("noise", 0): [60.0] * 5, ("noise", 1): [60.0] * 5}
+    better = {**steady, ("noise", 0): [70.0] * 5, ("noise", 1): [70.0] * 5}
+    found = kept(better, steady)
+    assert found == pytest.approx({"student": 0.7, "expert": 0.6, "difference": 0.1, "low": 0.1,
+                                   "high": 0.1})
+    assert tables.kept_cell(found) == "**0.70 / 0.60, +0.10 (+0.10 to +0.10)**"
+    assert tables.kept_cell(kept(steady, better)) == "**0.60 / 0.70, -0.10 (-0.10 to -0.10)**"
+    one = kept({**steady, ("noise", 0): [80.0] * 5}, steady)  # joints scatter: 0, 0.1 or 0.2
+    assert (one["low"], one["high"]) == pytest.approx((0, 0.2)) and "*" not in tables.kept_cell(one)
+    lucky = {**steady, ("noise", 0): [20.0, 100, 20, 100, 60], ("noise", 1): [100, 20, 60, 60, 60]}
+    same = kept(lucky, lucky)  # the same episodes are drawn for both
+    assert same["low"] == same["high"] == 0
+    episodes = kept(lucky, steady)
+    assert episodes["difference"] == 0 and -0.4 < episodes["low"] < -0.1 < 0.1 < episodes["high"]
+    blind = kept({**steady, ("noise", 0): [20.0, 100, 20, 100, 60], ("noise", 1): [
+        20.0, 100, 20, 100, 60]}, steady, keep_each=False)
+    error = np.std([20, 100, 20, 100, 60], ddof=1) / 5 ** 0.5 / 100  # shared by both joints
+    assert blind["high"] == pytest.approx(1.96 * error, rel=0.1) == -blind["low"]
+    whole = kept({**steady, ("none", 0): [90.0, 110, 90, 110, 100], ("noise", 0): [
+        90.0, 110, 90, 110, 100], ("noise", 1): [90.0, 110, 90, 110, 100]}, steady, keep_each=False)
+    error = 2 ** 0.5 * np.std([90, 110, 90, 110, 100], ddof=1) / 5 ** 0.5 / 100  # two lucks
+    assert whole["high"] - whole["low"] == pytest.approx(2 * 1.96 * error, rel=0.1)
+    assert kept(steady, {**steady, ("none", 0): [0.0] * 5}) is None
+    assert tables.kept_cell(None) == "-"
+
+
+def test_bands_over_seeds_are_sample_deviations(monkeypatch, tmp_path):
+    pytest.importorskip("matplotlib")
+    kept = []
+    monkeypatch.setattr(fac, "save_figure", lambda path, figure: kept.append(figure))
+    tables.draw_lines(tmp_path / "x.png", {"task": ({"case": {1: [3.0, 5.0], 2: [7.0]}}, None)},
+                      "step")
+    (band,) = kept[0].axes[0].collections
+    heights = {x: band.get_paths()[0].vertices[band.get_paths()[0].vertices[:, 0] == x, 1]
+               for x in (1, 2)}
+    assert np.ptp(heights[1]) == pytest.approx(2 * 2 ** 0.5) and np.ptp(heights[2]) == 0
 
 
 def test_tables_hold_where_curves_end():
     assert experiments.last({1: [1.0], 2: [3.0, 5.0]}, {1: [0.1], 2: [0.5, 0.25]}) == {
-        "mean": 4, "std": 1, "seeds": 2, "rank_return": 0.375}
+        "mean": 4, "std": 2 ** 0.5, "seeds": 2, "rank_return": 0.375}
     own = [{"step": str(i), "return_mean": value, "expert_mean": "10"}
            for i, value in enumerate(("1", "9"))]
     runs = {("walker-walk", "0", "online", "{}"): own}
     assert experiments.follow_up(runs, "walker-walk")[0] == 0.9
+    runs["walker-walk", "1", "online", "{}"] = [{"step": "1", "return_mean": 9, "expert_mean": 2}]
+    assert experiments.follow_up(runs, "walker-walk")[0] == 18 / 12  # of means
     records = fac.read_records(fac.data_file("walker-run", "expert.npz"))
     returns = max((returns for returns, _ in records.values()), key=len)
     level = experiments.expert_level("walker-run", [("walker-run", "0", "x", '{"episodes": 2}')])
@@ -796,6 +903,7 @@ def test_report_draws_what_the_csvs_hold(tmp_path):
         {"return_mean": value, "minutes": 1.0}]) for case in ("expert", "student")
         for about, value in (({}, 9.0), *(({"joint": j, "kind": kind}, 4.0 + 2 * j)
                                           for j in (0, 1) for kind in ("noise", "0.5", "1.5")))])
+    write_student_rows(tmp_path / "students.csv")
     write_rows(tmp_path / "figure7.csv", [("walker-run", 0, case, {"samples": s, "iterations": i}, [
         {"return_mean": value, "minutes": 1.0}, {"ms": ms, "ms_workers": ms / 2}])
         for case in ("expert", "student")
@@ -803,7 +911,7 @@ def test_report_draws_what_the_csvs_hold(tmp_path):
                                 (16, 6, 97.0 * (case == "student"), 4.0))])
     found = last_json(run("report", "--results", ".", "--figures", "pictures", "--json",
                           cwd=tmp_path))
-    last = {"mean": 11.0, "std": 1.0, "seeds": 2}
+    last = {"mean": 11.0, "std": 2 ** 0.5, "seeds": 2}
     level = found["figure4"]["walker-run"].pop("expert_recorded")
     assert round(level) == 674 and found["figure5"]["walker-run"].pop("expert_recorded") == level
     assert found["figure4"]["walker-run"] == dict.fromkeys(experiments.FIGURE4, last)
@@ -815,12 +923,140 @@ def test_report_draws_what_the_csvs_hold(tmp_path):
                                                          "1.5": 5.0}
     (row,) = found["figure7"]
     assert row["task"] == "walker-run" and row["ratio"] == 6.0 and row["ratio_in_process"] == 3.0
-    assert row["expert"] == {"samples": 64, "iterations": 6, "ms": 12.0}
-    assert row["student"] == {"samples": 16, "iterations": 6, "ms": 2.0}
+    assert row["expert"] == {"samples": 64, "iterations": 6, "ms": 12.0, "return": 96.0}
+    assert row["student"] == {"samples": 16, "iterations": 6, "ms": 2.0, "return": 97.0}
+    assert list(found.pop("students")) == ["walker-run, 128 x 4", "walker-run, 512 x 6"]
     assert sorted(os.listdir(tmp_path / "pictures")) == sorted(f"{k}.png" for k in found)
     text = (tmp_path / "report.md").read_text(encoding="utf-8")
     for part in ("## Figure 13", "809 / 836 / 697 / 560", "11 ± 1 (2)", "pictures/figure7.png"):
         assert part in text
+
+
+# students -----------------------------------------------------------------------------
+
+def write_student_rows(path, policy=(90.0, 110.0)):
+    """Two seeds of a default student, one of the paper's, and a second budget."""
+    def rows(first, second):
+        return [{"step": 9, "return_mean": np.mean(returns), "returns": returns,
+                 "expert_returns": [200.0, 50.0], "policy_returns": policy, "minutes": 6.0,
+                 "evaluation_seed": evaluation_seed, "ranks": {
+                     "rank_correlation_returns": [0.9, 0.5]}}
+                for evaluation_seed, returns in ((1, second), (0, first))]
+
+    small, full = ({"samples": s, "iterations": i, "steps": 9, "num_agents": 6}
+                   for s, i in ((128, 4), (512, 6)))
+    write_rows(path, [("walker-run", 0, "default", small, rows([180.0, 20.0], [250.0, 0.0])),
+                      ("walker-run", 1, "default", small, rows([140.0, 10.0], [200.0, 0.0])),
+                      ("walker-run", 0, "paper", small, rows([90.0, 10.0], [80.0, 0.0])),
+                      ("walker-run", 0, "default", full, rows([100.0, 0.0], [100.0, 0.0])),
+                      ("walker-run", 1, "default", full, rows([100.0, 0.0], [100.0, 0.0]))])
+
+
+def test_the_table_of_students_has_a_line_for_each_budget_and_columns_for_each_preset(tmp_path):
+    write_student_rows(tmp_path / "students.csv")
+    result, text = experiments.report_students("students", tmp_path / "students.csv", tmp_path)
+    heads, _, first, second = (
+        [part.strip() for part in line.split("|")[1:-1]] for line in text.splitlines())
+    row = dict(zip(heads, first))
+    assert row.pop("task") == "walker-run" and row.pop("MPPI") == "128 x 4" and row["N"] == "6"
+    assert row["expert"] == "125 ± 75" and row["its policy alone"] == "100 ± 10"  # over episodes
+    assert row["student, default"] == "88 ± 18"  # 100 and 75: over seeds, n - 1
+    assert row["worst, default"] == "140"        # of the episode that the expert solves
+    assert row["kept, default"] == "0.70 (0.80 / 0.60)"
+    assert row["kept, evaluation seed 1, default"] == "0.90 (1.00 / 0.80)"
+    assert row["rank correlation of G, H = 0 / last, default"] == "0.90 / 0.50"
+    assert row["kept, paper"] == "0.40" and row["minutes, default"] == "6"
+    assert row["authors' logs: 100% TD-MPC / Fac-TDMPC"] == "836 / 809"
+    other = dict(zip(heads, second))
+    assert other["MPPI"] == "512 x 6" and other["kept, paper"] == "-"
+    assert list(result) == ["walker-run, 128 x 4", "walker-run, 512 x 6"]
+    write_student_rows(tmp_path / "none.csv", policy=())  # an expert without a policy
+    _, text = experiments.report_students("students", tmp_path / "none.csv", tmp_path)
+    assert "| 125 ± 75 | - | 88 ± 18 |" in text
+
+
+def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkeypatch):
+    steps, step, rows = [], fac.Distiller.step, []
+    monkeypatch.setattr(fac.Distiller, "step", lambda self: (steps.append(1), step(self))[1])
+    monkeypatch.setattr(fac, "rank_correlation", lambda *_: (np.full(4, 0.5), np.full(4, 0.25)))
+    monkeypatch.setattr(fac, "time_both", lambda *_: {
+        "plan_ms_expert": 1.0, "plan_ms_student_in_process": 1.0, "plan_ms_student": 1.0,
+        "plan_workers": 0})
+    monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: rows.extend(
+        row for run in runs for row in experiments.attempt(function, run, os.getpid())))
+    for samples in ("8", "4"):  # another budget: the student is there
+        assert experiments.main([
+            "students", "--tasks", "reacher-easy", "--seeds", "3", "--steps", "1", "--episodes",
+            "1", "--iterations", "1", "--samples", samples, "--students", str(tmp_path)]) == 0
+    experiments.append_rows(path := tmp_path / "students.csv", rows)
+    rows = experiments.read_rows(path)
+    assert [row["evaluation_seed"] for row in rows] == ["1", "0"] * 2 and len(steps) == 1
+    assert [json.loads(row["settings"])["samples"] for row in rows] == [8, 8, 4, 4]
+    assert len(experiments.finished(rows)) == 2
+    model, header = fac.load_model(tmp_path / "reacher-easy-3" / "student.npz")
+    assert (header["seed"], model.config.num_agents, header["distill"]["steps"]) == (3, 3, 1)
+    expert, _ = fac.load_model(fac.data_file("reacher-easy", "expert.npz"))
+    planning = fac.PlannerConfig(samples=4, iterations=1)
+    for row in rows[2:]:
+        seeds = fac.episode_seeds(int(row["evaluation_seed"]), 1)
+        expected = {"policy_returns": students.policy_returns(expert, "reacher-easy", seeds)}
+        for key, who in (("returns", model), ("expert_returns", expert)):
+            expected[key] = fac.play(who, "reacher-easy", planning, seeds, 0)[2].sum(1)
+        for key, returns in expected.items():
+            np.testing.assert_allclose(json.loads(row[key]), returns, atol=1e-3)
+        assert json.loads(row["ranks"])["rank_correlation_returns"] == [0.25] * 4
+        assert row["versions"] == experiments.versions()
+        assert f"numpy {np.__version__}" in row["versions"] and "mujoco 3" in row["versions"]
+    result = json.loads((tmp_path / "reacher-easy-3" / "result.json").read_text())
+    assert result["eval_seed"] == 0
+    experiments.report_students("students", path, tmp_path)
+
+
+def test_a_preset_s_students_have_its_budget_and_a_folder_of_their_own(monkeypatch):
+    seen = []
+    monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: seen.extend(runs))
+    for flags in ([], ["--preset", "paper"], ["--preset", "paper", "--steps", "14000", "--samples",
+                                              "128", "--iterations", "4"]):
+        assert experiments.main(["students", "--tasks", "walker-run", "--seeds", "0", *flags]) == 0
+    found = [(run["case"], *(json.loads(run["settings"])[k] for k in (
+        "steps", "samples", "iterations"))) for run in seen]
+    assert found == [("default", 14000, 128, 4), ("paper", 100000, 512, 6),
+                     ("paper", 14000, 128, 4)]
+    assert [str(students.folder("runs", "walker-run", 0, preset)) for preset in (
+        "default", "paper")] == ["runs/walker-run-0", "runs/walker-run-0-paper"]
+
+
+def test_a_policy_alone_acts_by_what_it_sees(monkeypatch):
+    class Robot:
+        """Rewards the action that the policy takes in what it showed last."""
+
+        def __init__(self, task):
+            self.obs = None
+
+        def reset(self, seed):
+            self.obs = np.full(8, seed / 10, np.float32)
+            return self.obs
+
+        def step(self, action):
+            expected = expert.policy(expert.encode(self.obs[:, None]))[0, :, 0]
+            self.obs = -self.obs
+            return self.obs, float(np.array_equal(action, expected))
+
+    expert = random_model(1, policy=True)
+    monkeypatch.setattr(fac, "Environment", Robot)
+    assert students.policy_returns(expert, "x", [1, 2]) == [fac.EPISODE_STEPS] * 2
+    assert students.policy_returns(random_model(3), "x", [1, 2]) == []
+
+
+def test_returns_of_other_versions_are_said_to_be_old(tmp_path, capsys):
+    rows = [{"step": 1, "return_mean": 1.0, "minutes": 1.0}]
+    for i, known in enumerate((experiments.versions(), "numpy 1.0", "")):
+        write_rows(tmp_path / f"{i}.csv", [("walker-run", 0, "TAP", {}, [
+            {**rows[0], "versions": known}])])
+        experiments.settled(tmp_path / f"{i}.csv")
+    found = capsys.readouterr().err
+    assert "0.csv: returns" not in found and "1.csv: returns of numpy 1.0; now numpy" in found
+    assert "2.csv: returns of versions that it doesn't name" in found
 
 
 # watch --------------------------------------------------------------------------------

@@ -1,0 +1,118 @@
+"""Students as `distill` makes them, and the README's main table: `experiments.py students`."""
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+import fac_tdmpc_ref as fac  # noqa: E402
+from tables import deviation, markdown, of_returns  # noqa: E402
+
+EVALUATION_SEEDS = (0, 1)
+SOLVED = 100  # what an expert gets in an episode that it solves
+FLAGS = {"samples": "plan-samples", "iterations": "plan-iterations", "num_agents": "num-agents"}
+
+
+def folder(students, task, seed, preset):
+    """Where `distill` leaves a student: TASK-SEED, its own default, or TASK-SEED-PRESET."""
+    return Path(students) / "-".join([task, str(seed), *[preset][:preset != "default"]])
+
+
+def distil_student(task, seed, preset, settings, students):
+    """Distil a student by `distill`, which leaves it in `students`, once; a row for each evaluation
+    seed. settings: of FLAGS, `steps` and `episodes`."""
+    flags = [f"--{FLAGS.get(name, name)}={value}" for name, value in settings.items()]
+    expert, _ = fac.load_model(fac.data_file(task, "expert.npz"))
+    for evaluation_seed in reversed(EVALUATION_SEEDS):  # the first's result.json stays
+        args = fac.make_parser().parse_args([
+            "distill", "--task", task, "--seed", str(seed), "--preset", preset, "--workers", "0",
+            "--out", str(folder(students, task, seed, preset)), *flags,
+            "--eval-seed", str(evaluation_seed)])
+        found = args.run(args)
+        policy = policy_returns(expert, task, fac.episode_seeds(evaluation_seed, args.episodes))
+        yield {"step": found["steps"], **of_returns(found["student_returns"], evaluation_seed),
+               "expert_mean": found["expert_return_mean"], "rank_q": found["rank_correlation"],
+               "rank_return": found["rank_correlation_returns"][-1],
+               "expert_returns": np.round(found["expert_returns"], 3).tolist(),
+               "policy_returns": np.round(policy, 3).tolist(), "minutes": found["seconds"] / 60,
+               "ranks": {k: v for k, v in found.items() if k.startswith("rank_correlation")}}
+
+
+def policy_returns(expert, task, seeds):
+    """Returns of episodes in which an expert's policy acts, without planning; [] if it has none."""
+    environment, returns = fac.Environment(task), []
+    for seed in seeds if expert.has_policy else []:
+        obs, total = environment.reset(seed), 0.0
+        for _ in range(fac.EPISODE_STEPS):
+            obs, reward = environment.step(expert.policy(expert.encode(obs[:, None]))[0, :, 0])
+            total += reward
+        returns.append(total)
+    return returns
+
+
+def mean_and_spread(values, spread):
+    """'mean ± spread', or the mean of one."""
+    values = np.array(values)
+    return f"{values.mean():.0f}" + (f" ± {spread(values):.0f}" if len(values) > 1 else "")
+
+
+def kept(rows):
+    """The student's mean return by its expert's: over all seeds (a ratio of means), and of each."""
+    def ratio(rows):
+        return fac.return_kept(*(np.mean([np.mean(json.loads(row[key])) for row in rows])
+                                 for key in ("returns", "expert_returns")))
+    found = [ratio(rows), *(ratio([row]) for row in rows)]
+    whole, *each = ("-" if x is None else f"{x:.2f}" for x in found)
+    return whole if len(rows) == 1 else f"{whole} ({' / '.join(each)})"
+
+
+def worst(rows):
+    """A student's worst return in an episode that its expert solves; None: it solves none."""
+    return min((own for row in rows for own, expert in zip(
+        *(json.loads(row[key]) for key in ("returns", "expert_returns")))
+        if expert >= SOLVED), default=None)
+
+
+def ranks(rows):
+    """Rank correlation of G over H = 0 / the last, mean over seeds."""
+    found = [json.loads(row["ranks"])["rank_correlation_returns"] for row in rows]
+    return " / ".join(f"{np.mean([by_step[h] for by_step in found]):.2f}" for h in (0, -1))
+
+
+def cells(rows):
+    """A preset's cells of the table, of {evaluation seed: rows by seed}."""
+    if not all(rows[seed] for seed in EVALUATION_SEEDS):
+        return ["-"] * 6
+    first, lowest = rows[0], worst(rows[0])
+    return [mean_and_spread([float(row["return_mean"]) for row in first], deviation),
+            "-" if lowest is None else f"{lowest:.0f}", *(kept(rows[s]) for s in EVALUATION_SEEDS),
+            ranks(first), f"{np.mean([float(row['minutes']) for row in first]):.0f}"]
+
+
+def table(rows, authors):
+    """The README's main table, {"TASK, SAMPLES x ITERATIONS": {preset: cells}} and Markdown: a line
+    for each task and planner's budget, columns for each preset. authors: {task: text}."""
+    runs, presets = {}, list(dict.fromkeys(row["case"] for row in rows))
+    for row in rows:
+        budget = "{samples} x {iterations}".format_map(json.loads(row["settings"]))
+        runs.setdefault((row["task"], budget), {}).setdefault(
+            row["case"], {seed: [] for seed in EVALUATION_SEEDS})[
+            int(row["evaluation_seed"])].append(row)
+    lines, result = [], {}
+    for (task, budget), found in runs.items():
+        row = next(iter(found.values()))[0][0]
+        policy = json.loads(row["policy_returns"])
+        own = {preset: cells(found[preset]) for preset in found}
+        result[f"{task}, {budget}"] = own
+        lines.append([task, json.loads(row["settings"])["num_agents"], budget,
+                      mean_and_spread(json.loads(row["expert_returns"]), np.std),
+                      mean_and_spread(policy, np.std) if policy else "-",
+                      *sum((own.get(preset, ["-"] * 6) for preset in presets), []),
+                      authors.get(task, "-")])
+    heads = ["student", "worst", "kept", "kept, evaluation seed 1",
+             "rank correlation of G, H = 0 / last", "minutes"]
+    return result, markdown([
+        "task", "N", "MPPI", "expert", "its policy alone",
+        *(f"{head}, {preset}" if len(presets) > 1 else head for preset in presets
+          for head in heads), "authors' logs: 100% TD-MPC / Fac-TDMPC"], lines)

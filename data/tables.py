@@ -1,0 +1,236 @@
+"""What `experiments.py report` says and draws: statistics, Markdown, lines.
+
+Over seeds ± is the sample deviation (n - 1); of one seed's episodes it is the deviation of just
+these returns (n). A ratio is one of means, never a mean of ratios.
+"""
+import itertools
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+import fac_tdmpc_ref as fac  # noqa: E402
+
+
+def deviation(values):
+    """Sample deviation (n - 1), over seeds; of one: 0."""
+    return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+
+
+def of_returns(returns, evaluation_seed):
+    """A row's columns of episodes' returns; the deviation is of these (n), not a sample's."""
+    return {"return_mean": float(np.mean(returns)), "return_std": float(np.std(returns)),
+            "return_min": float(np.min(returns)), "evaluation_seed": evaluation_seed,
+            "returns": np.round(returns, 3).tolist()}
+
+
+def last(curve, ranks):
+    """Mean and sample deviation over seeds, and their number, where a curve ends; the rank
+    correlation of G there, if it was measured."""
+    values = curve[max(curve)]
+    found = {"mean": float(np.mean(values)), "std": deviation(values), "seeds": len(values)}
+    return {**found, "rank_return": float(np.mean(ranks[max(ranks)]))} if ranks else found
+
+
+def markdown(heads, rows):
+    """A Markdown table."""
+    return "\n".join("| " + " | ".join(map(str, row)) + " |" for row in (
+        heads, ["---"] * len(heads), *rows)) + "\n"
+
+
+def cell(found):
+    """mean ± deviation over seeds, if there are several (their number), rank correlation of G."""
+    if not found:
+        return "-"
+    rank = f", {found['rank_return']:.2f}" if "rank_return" in found else ""
+    spread = f" ± {found['std']:.0f} ({found['seeds']})" if found["seeds"] > 1 else ""
+    ms = f", {found['ms']:.1f} / {found['ms_workers']:.1f} ms" if "ms" in found else ""
+    return f"{found['mean']:.0f}{spread}{rank}{ms}"
+
+
+def draw_lines(path, panels, xlabel, **axes):
+    """A panel each {title: ({label: {x: [values]}}, level or None)}: mean and band (± sample
+    deviation) over seeds; the level, an expert's, is a line across."""
+    plt = fac.pyplot()
+    labels = list(dict.fromkeys(label for lines, _ in panels.values() for label in lines))
+    cycle, columns = list(plt.rcParams["axes.prop_cycle"]), min(4, len(panels))
+    figure, grid = plt.subplots(-(-len(panels) // columns), columns, squeeze=False,
+                                figsize=(3.6 * columns, 3.8 * -(-len(panels) // columns)),
+                                layout="constrained")
+    for ax, (title, (lines, level)) in itertools.zip_longest(grid.flat, panels.items(),
+                                                             fillvalue=(None, (None, None))):
+        if lines is None:
+            ax.remove()
+            continue
+        order = labels if len(labels) <= len(cycle) else list(lines)  # one style, one line
+        for label, points in lines.items():
+            style = cycle[order.index(label) % len(cycle)]
+            x = sorted(points)
+            mean, std = (np.array([f(points[v]) for v in x]) for f in (np.mean, deviation))
+            ax.plot(x, mean, marker=".", label=label, **style)
+            ax.fill_between(x, mean - std, mean + std, color=style["color"], alpha=0.15)
+        if level is not None:
+            ax.axhline(level, color="black", linewidth=0.8, linestyle=(0, (1, 3)), label="expert")
+        ax.set(title=title, xlabel=xlabel, ylabel="episode return",
+               ylim=(0, 1.05 * ax.get_ylim()[1]), **axes)
+        if axes:  # logarithmic: a tick for each point
+            ax.set_xticks(x := sorted(set().union(*lines.values())), [f"{v:.0f}" for v in x])
+            ax.minorticks_off()
+        else:
+            ax.locator_params("x", nbins=5)
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, fontsize=8)
+    fac.save_figure(path, figure)
+
+
+# -------------------------------------------------------------------- Figure 7: equal return
+
+KEEPS = 0.95  # of a return: what is still as good
+
+
+def halves(row):
+    """Means of a run's even and odd episodes: one half a budget is chosen by, the other it is
+    reported on. Of a row that holds no episode's return (or one's) both are its mean."""
+    returns = json.loads(row["returns"] or "[]")
+    return ((np.mean(returns[::2]), np.mean(returns[1::2])) if len(returns) > 1
+            else (float(row["return_mean"]),) * 2)
+
+
+def cheapest(budgets, level, key):
+    """Of {(samples, iterations): {"chosen_by", "return", "ms", ...: [one for each seed]}} the
+    budget with the fewest mean milliseconds `key` that reaches a level, as {"samples",
+    "iterations", "ms", "return"}; None if none does, or one that does isn't timed."""
+    good = {budget: found for budget, found in budgets.items()
+            if np.mean(found["chosen_by"]) >= level}
+    if not good or not all(found[key] for found in good.values()):
+        return None
+    best = min(good, key=lambda budget: np.mean(good[budget][key]))
+    return {"samples": best[0], "iterations": best[1], "ms": float(np.mean(good[best][key])),
+            "return": float(np.mean(good[best]["return"]))}
+
+
+def compare_budgets(cases, levels):
+    """The cheapest budgets of the expert and of the student, alone and with workers, that reach
+    {case: level}, and the expert's milliseconds by the student's; None if one is missing."""
+    expert, alone, workers = (cheapest(cases[case], levels[case], key) for case, key in (
+        ("expert", "ms"), ("student", "ms"), ("student", "ms_workers")))
+    if None in (expert, alone, workers):
+        return None
+    best = min(alone, workers, key=lambda found: found["ms"])
+    return {"expert": expert, "student": best, "student_in_process": alone,
+            "student_workers": workers, "ratio": expert["ms"] / best["ms"],
+            "ratio_in_process": expert["ms"] / alone["ms"]}
+
+
+def budgets_of(task, cases):
+    """Figure 7 of a task: `compare_budgets` at 0.95 of each model's own full return and, under
+    `equal_return`, of the lower one; by budget what is kept and the speed-up. None: not timed."""
+    full = {case: np.mean(budgets.get((512, 6), {"chosen_by": [np.nan]})["chosen_by"])
+            for case, budgets in cases.items()}
+    if set(full) != {"expert", "student"}:
+        return None
+    own, equal = (compare_budgets(cases, levels) for levels in (
+        {case: KEEPS * value for case, value in full.items()},
+        dict.fromkeys(full, KEEPS * min(full.values()))))
+    if not (own and equal):
+        return None
+    row = {"task": task, **own, "equal_return": equal, "kept": {}, "speedup": {}}
+    for budget in [(512, 6), (128, 4)]:
+        expert, student = (cases[case].get(budget) for case in ("expert", "student"))
+        if expert and student:
+            name, ms = "{} x {}".format(*budget), np.mean(expert["ms"])
+            row["kept"][name] = fac.return_kept(np.mean(student["all"]), np.mean(expert["all"]))
+            row["speedup"][name] = [float(ms / x) for x in (np.mean(student["ms"]), min(
+                np.mean(student["ms"]), np.mean(student["ms_workers"])))]
+    return row
+
+
+def budget_cells(row):
+    """A line of Figure 7's table."""
+    def models(found):
+        return [*("{samples} x {iterations}: {return:.0f}, {ms:.1f} ms".format_map(found[key])
+                  for key in ("expert", "student_in_process", "student_workers")),
+                "{ratio_in_process:.1f} / {ratio:.1f}".format_map(found)]
+    return [row["task"], *models(row["equal_return"]), *models(row),
+            " / ".join("-" if x is None else f"{x:.2f}" for x in row["kept"].values()),
+            " / ".join(f"{x:.2f}" for x in row["speedup"].get("128 x 4", [])) or "-"]
+
+
+# --------------------------------------------------------- Figure 8: differences, intervals
+
+DRAWS = 4000  # of the bootstrap
+MAX_RETURN = 1000  # of an episode of dm_control
+
+
+def drawn_means(rows, episodes, luck):
+    """Means (DRAWS,), over seeds, of the drawn `episodes` (DRAWS, E) of runs. Of one whose row
+    holds no episode's return: its mean and `luck` (DRAWS,) of its standard errors."""
+    found = []
+    for row in rows:
+        returns = np.array(json.loads(row["returns"] or "[]"))
+        n = json.loads(row["settings"]).get("episodes", 1)
+        error = float(row["return_std"] or 0) / max(1, n - 1) ** 0.5
+        found.append(returns[episodes].mean(1) if len(returns) else
+                     float(row["return_mean"]) + luck * error)
+    return np.mean(found, 0)
+
+
+def kept_difference(student, expert, kind, joints):
+    """What student and expert keep of their undisturbed return, mean over joints; the difference,
+    and where 95% of a bootstrap over episodes and joints lie (low, high).
+
+    student, expert: {(kind, joint): rows}. Both play the same episodes, so these are drawn for
+    both. Where rows hold no episode's return, a model's luck is the same for all joints: as wide
+    as it can be. None where there is nothing to keep."""
+    rng = np.random.default_rng(0)
+    count = json.loads(student["none", 0][0]["settings"]).get("episodes", 1)
+    episodes = rng.integers(count, size=(DRAWS, count))
+    drawn = rng.integers(len(joints), size=(len(joints), DRAWS))
+    kept, draws = [], []
+    for rows in (student, expert):
+        whole, *parts = (np.mean([float(row["return_mean"]) for row in rows[key]])
+                         for key in (("none", 0), *((kind, joint) for joint in joints)))
+        kept.append(fac.return_kept(np.mean(parts), whole))
+        luck = rng.standard_normal((2, DRAWS))
+        whole = np.clip(drawn_means(rows["none", 0], episodes, luck[0]), 1, MAX_RETURN)
+        parts = np.clip([drawn_means(rows[kind, joint], episodes, luck[1]) for joint in joints],
+                        0, MAX_RETURN)
+        draws.append(np.take_along_axis(parts, drawn, 0).mean(0) / whole)
+    if None in kept:
+        return None
+    low, high = np.percentile(draws[0] - draws[1], (2.5, 97.5)).tolist()
+    return {"student": kept[0], "expert": kept[1], "difference": kept[0] - kept[1],
+            "low": low, "high": high}
+
+
+def kept_cell(found):
+    """Both, the difference and its interval; bold if that leaves out 0."""
+    if found is None:
+        return "-"
+    text = "{student:.2f} / {expert:.2f}, {difference:+.2f} ({low:+.2f} to {high:+.2f})".format(
+        **{key: round(x, 2) + 0.0 for key, x in found.items()})  # no -0.00
+    return f"**{text}**" if found["low"] > 0 or found["high"] < 0 else text
+
+
+def draw_bars(path, cells, kinds):
+    """Bars of the return with each action dimension disturbed, {task: {case: {(kind, joint):
+    [values]}}}; lines across: undisturbed, ("none", 0)."""
+    plt = fac.pyplot()
+    figure, grid = plt.subplots(len(cells), len(kinds), squeeze=False, layout="constrained",
+                                figsize=(11, 2.8 * len(cells)), sharey="row")
+    for row, (task, cases) in zip(grid, cells.items()):
+        actions = fac.lookup_task(task)[3]
+        for ax, kind in zip(row, kinds):
+            for i, (case, values) in enumerate(sorted(cases.items())):
+                joints = sorted(j for k, j in values if k == kind)
+                ax.bar(np.array(joints) + 0.4 * i - 0.2,
+                       [np.mean(values[kind, j]) for j in joints], 0.38, label=case,
+                       color=f"C{i}", hatch=("", "//")[i % 2], edgecolor="black")
+                if ("none", 0) in values:
+                    ax.axhline(np.mean(values["none", 0]), color=f"C{i}", linestyle=("-", "--")[i])
+            what = "one action is noise" if kind == "noise" else f"one motor x {kind}"
+            ax.set(title=f"{task}: {what}", xlabel="action dimension", ylabel="episode return",
+                   xticks=range(0, actions, 1 + actions // 20))
+    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    fac.save_figure(path, figure)
