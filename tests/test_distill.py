@@ -80,6 +80,24 @@ def test_rank_correlation_of_the_expert_with_itself_is_one(replay):
         assert of_q_or_return.shape == (4,) and np.allclose(of_q_or_return, 1, atol=1e-6)
 
 
+def test_rank_correlations_are_over_32_sequences_discounted_as_planned(replay, monkeypatch):
+    distiller, copies = distilled(replay, CONFIG, 0)[0], []
+    weights = distiller.optimizer.vector  # of which some begin at zero
+    weights += 0.1 * np.random.default_rng(0).standard_normal(len(weights))
+
+    def watched(*args):
+        features, actions, predictions = fac.perturbed_batch(*args)
+        copies.append(actions.shape[3])
+        return features, actions, predictions
+
+    monkeypatch.setattr(distiller, "perturb", watched)
+    _, of_rewards, *_ = fac.rank_correlation(distiller, 16, 0.0)
+    assert set(copies) == {32}
+    assert (of_rewards[1:] == of_rewards[1]).all() and of_rewards[0] != of_rewards[1]
+    _, of_returns, *_ = fac.rank_correlation(distiller, 16, 0.9)
+    assert len(set(of_returns)) == 4 and of_returns[0] == of_rewards[0]  # Q alone
+
+
 def test_rank_correlations_are_spearman_s():
     from scipy.stats import spearmanr
     x = np.random.default_rng(0).standard_normal((3, 9))
@@ -172,6 +190,17 @@ def test_a_student_s_own_actions_begin_where_their_state_is(replay):
     assert 0.35 < played.mean() < 0.65  # the others' are the policy's [D8]
 
 
+def test_own_states_are_drawn_from_all_of_all_own_episodes(replay):
+    (obs, action), count = ramp(), 2000
+    config = fac.dataclasses.replace(CONFIG, encoder_input="observation", own_share=1.0,
+                                     noise_samples=2)
+    with fresh(replay, config) as distiller:
+        distiller.add(np.stack([obs[:-1], -obs[:-1]]), np.stack([action, action]))
+        (features,), _, _ = distiller.draw(0, 0, count)
+    drawn, _ = np.histogram(features[0], 8, (-496, 496))  # a quarter of an episode each
+    assert drawn.sum() == count and drawn.min() > 0.7 * count / 8 and drawn.max() < 1.3 * count / 8
+
+
 def test_a_student_plays_no_own_episode_twice(replay, tmp_path, monkeypatch):
     seen = []
     monkeypatch.setattr(fac, "play", lambda model, task, planning, seeds, *_: (
@@ -187,6 +216,21 @@ def test_a_student_plays_no_own_episode_twice(replay, tmp_path, monkeypatch):
 def test_perturbed_actions_are_clipped_where_they_should_be(replay, clip):
     with fresh(replay, fac.dataclasses.replace(CONFIG, clip_actions=clip)) as distiller:
         assert (np.abs(distiller.draw(0, 0, 64)[1]).max() <= 1) == clip
+
+
+def test_perturbations_are_of_their_deviation_and_each_its_own(replay):
+    config = fac.dataclasses.replace(CONFIG, noise_std=0.3, noise_samples=50, clip_actions=False)
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (4, 3, 20, 1)).astype(np.float32)
+    with fresh(replay, config) as distiller:
+        _, perturbed, _ = fac.perturbed_batch(distiller.expert, distiller.student,
+                                              np.zeros((8, 20), np.float32), actions, config, rng)
+    noise = perturbed - actions
+    assert noise.shape == (4, 3, 20, 50)
+    assert abs(noise.std() / 0.3 - 1) < 0.03 and abs(noise.mean()) < 0.02
+    for axis in range(4):  # of step, dimension, state and copy
+        one, two = np.moveaxis(noise, axis, 0)[:2]
+        assert abs(np.corrcoef(one.ravel(), two.ravel())[0, 1]) < 0.2
 
 
 def test_no_two_parts_of_a_pool_share_perturbations(replay):

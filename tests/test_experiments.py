@@ -547,6 +547,19 @@ def test_a_disturbed_robot():
     assert np.array_equal(servos[1][0], servos[0][0])
 
 
+def test_figure_8_s_noise_is_a_standard_normal_cut_at_the_limits(monkeypatch):
+    seen, action = [], np.full(3, 0.25, np.float32)
+    monkeypatch.setattr(fac.Environment, "step", lambda self, action: seen.append(action))
+    environment = experiments.DisturbedEnvironment("reacher-hard", 1, "noise")
+    for _ in range(4000):
+        environment.step(action)
+    others, noise = np.delete(seen, 1, 1), np.array(seen)[:, 1]
+    assert (others == 0.25).all() and (action == 0.25).all()
+    assert (np.abs(noise) <= 1).all() and abs(noise.mean()) < 0.05
+    assert abs((np.abs(noise) == 1).mean() - 0.317) < 0.03  # beyond one deviation
+    assert abs(np.corrcoef(noise[1:], noise[:-1])[0, 1]) < 0.06
+
+
 def test_a_run_is_planned_disturbed_and_timed_as_it_says(monkeypatch, tmp_path):
     seen, made, planner = [], [], fac.Planner
     monkeypatch.setattr(experiments, "measure", lambda *args: seen.append(args) or {})

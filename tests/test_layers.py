@@ -165,6 +165,14 @@ def test_orthogonal():
         assert np.allclose(product, np.eye(min(rows, columns)))
 
 
+def test_orthogonal_matrices_are_uniform_over_rotations():
+    """No entry has a sign of its own, as QR's have: they are even, and each agent's are others."""
+    for rows, columns in ((5, 3), (3, 5), (4, 4)):
+        W = fac.orthogonal(np.random.default_rng(9), 600, rows, columns)
+        assert np.abs(W.mean(0)).max() < 0.1 and W.std(0).min() > 0.35
+        assert abs((W > 0).mean(0) - 0.5).max() < 0.1
+
+
 def test_create_follows_told():
     sizes = fac.ModelConfig(8, 3, 3, 50, 256, 170)
     params = fac.WorldModel.create(sizes, np.random.default_rng(0)).params

@@ -96,12 +96,47 @@ def test_an_iteration_by_hand(least):
                                atol=1e-6)
 
 
-def test_proposals_compete():
+@pytest.mark.parametrize("iterations", [1, 2, 3])
+def test_proposals_compete_in_every_iteration(iterations):
+    """No sample hits the optimum, so that where it is the last elite it was proposed there."""
     target = np.array([[[0.3], [-0.4]]], np.float32)
-    config = fac.PlannerConfig(samples=8, elites=1, iterations=1, momentum=0.0)
-    mean, _, _ = fac.mppi(quadratic(target), np.zeros_like(target), config, streams(1),
-                          target[..., None])
-    assert np.allclose(mean, target)
+    config = fac.PlannerConfig(samples=8, elites=1, iterations=iterations, momentum=0.0)
+    mean, elites, _ = fac.mppi(quadratic(target), np.zeros_like(target), config, streams(1),
+                               target[..., None])
+    assert np.array_equal(elites[..., 0], target) and np.allclose(mean, target)
+
+
+def test_an_elite_is_drawn_by_its_score_for_each_agent_alone():
+    scores = np.array([[0.1, 0.2, 0.3, 0.4], [0.7, 0.0, 0.1, 0.2]], np.float32)
+    elites = np.full((2, 3, 2, 4), 9, np.float32)  # (N, L, d, E)
+    elites[:, 0] = np.arange(4) + 10 * np.arange(2)[:, None]  # 0 to 3, 10 to 13
+    rngs = streams(2)
+    drawn = np.array([fac.draw_elite(elites, scores, rngs) for _ in range(4000)])
+    assert np.array_equal(drawn[:, :, 1], drawn[:, :, 0] + 10)  # both dimensions, of one elite
+    for chosen, score in zip(drawn[:, :, 0].astype(int).T, scores):
+        np.testing.assert_allclose(np.bincount(chosen, minlength=4) / 4000, score, atol=0.03)
+    assert abs(np.corrcoef(drawn[:, :, 0].T)[0, 1]) < 0.1
+
+
+def test_proposals_are_the_policy_s_actions_and_noise_of_their_own(monkeypatch):
+    """Rolled out in the model: what is left where the policy's mean is taken away."""
+    model, seen = random_model(1, policy=True), []
+    for part in ("weight", "bias"):
+        model.params[f"_pi.4.{part}"] *= 0.05  # small actions, which are not clipped
+    monkeypatch.setattr(fac, "mppi", lambda returns, mean, config, rngs, proposals: (
+        seen.append(proposals), (mean, mean[..., None], np.ones((1, 1))))[1])
+    config = fac.PlannerConfig(samples=8, iterations=1, horizon=2, pi_trajs=300)
+    fac.Planner(model, config).act(np.ones(8))
+    ((proposals,),) = seen
+    z, noise = np.repeat(model.encode(np.ones((8, 1), np.float32)), 300, 2), []
+    for a in proposals:
+        mean = model.policy(z)[0]
+        noise.append(a - mean)
+        z = model.next(z, a[None])
+    assert np.shape(noise) == (3, 3, 300) and 0.01 < np.abs(mean).max() < 0.7
+    for h in noise:
+        np.testing.assert_allclose(h.std(1), fac.POLICY_STD, rtol=0.2)
+    assert np.abs(np.corrcoef(np.reshape(noise, (9, -1))) - np.eye(9)).max() < 0.3
 
 
 @pytest.mark.parametrize("horizon", [3, 1, 0])
@@ -181,14 +216,16 @@ def test_warm_start_shifts_by_one():
     assert not planner.mean.any()
 
 
-def test_the_mean_is_executed_where_it_is_asked_for():
+@pytest.mark.parametrize("output", ["mean", "sampled"])
+def test_what_is_executed_is_what_is_asked_for(output):
     model = random_model()
-    config = fac.PlannerConfig(samples=32, iterations=1, horizon=2, output="mean")
+    config = fac.PlannerConfig(samples=32, iterations=1, horizon=2, output=output)
     planner, z = fac.AgentPlanner(model, config), model.encode(np.zeros((8, 1), np.float32))
     planner.reset(np.random.SeedSequence(0).spawn(3))
     twin = [np.random.Generator(np.random.SFC64(s)) for s in np.random.SeedSequence(0).spawn(3)]
-    mean, _, _ = fac.mppi(fac.Returns(model).start(z, config), planner.mean, config, twin)
-    assert np.array_equal(planner.plan(z), mean[:, 0])
+    mean, *elites = fac.mppi(fac.Returns(model).start(z, config), planner.mean, config, twin)
+    expected = mean[:, 0] if output == "mean" else fac.draw_elite(*elites, twin)
+    assert np.array_equal(planner.plan(z), expected)
 
 
 @pytest.mark.parametrize("output", ["sampled", "mean"])
