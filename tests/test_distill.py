@@ -85,9 +85,12 @@ def test_rank_correlations_are_over_32_sequences_discounted_as_planned(replay, m
     weights = distiller.optimizer.vector  # of which some begin at zero
     weights += 0.1 * np.random.default_rng(0).standard_normal(len(weights))
 
-    def watched(*args):
-        features, actions, predictions = fac.perturbed_batch(*args)
+    def watched(expert, student, obs, around, *rest):
+        features, actions, predictions = fac.perturbed_batch(expert, student, obs, around, *rest)
         copies.append(actions.shape[3])
+        for state, sequence in zip(obs.T, around[..., 0].transpose(2, 0, 1)):
+            ((row, *_),) = np.nonzero((replay.observation == state).all(1))
+            assert np.array_equal(replay.action[row:row + 4], sequence)  # what was done there
         return features, actions, predictions
 
     monkeypatch.setattr(distiller, "perturb", watched)
@@ -105,8 +108,10 @@ def test_rank_correlations_are_spearman_s():
     np.testing.assert_allclose(fac.spearman(x, y), [spearmanr(a, b)[0] for a, b in zip(x, y)])
 
 
-def test_same_seed_same_student(replay):
-    students = [distilled(replay, CONFIG, 5, seed=seed)[0].optimizer.vector for seed in (1, 1, 2)]
+@pytest.mark.parametrize("steps", [0, 5])
+def test_same_seed_same_student(replay, steps):
+    students = [distilled(replay, CONFIG, steps, seed=seed)[0].optimizer.vector
+                for seed in (1, 1, 2)]
     assert np.array_equal(students[0], students[1])
     assert not np.array_equal(students[0], students[2])
 
@@ -279,6 +284,18 @@ def test_a_step_in_halves_is_the_step_of_the_whole(replay, batch):
     np.testing.assert_allclose(seen[0], gradient, rtol=1e-3, atol=1e-5 * np.abs(gradient).max())
 
 
+def test_a_step_learns_at_its_rate_and_clips_its_gradient(replay, monkeypatch):
+    config, seen = fac.dataclasses.replace(CONFIG, grad_clip=0.5), []
+    with fresh(replay, config) as distiller:
+        step = distiller.optimizer.step
+        monkeypatch.setattr(distiller.optimizer, "step",
+                            lambda lr, clip: seen.append((lr, clip)) or step(lr, clip))
+        for _ in range(3):
+            distiller.step()
+    assert seen == [(fac.learning_rate(config, t), 0.5) for t in range(3)]
+    assert len({lr for lr, _ in seen}) == 3
+
+
 def test_returns_over_every_horizon_are_equation_2():
     """What the rank correlation of G is taken of, against what planning uses."""
     model, rng = random_model(), np.random.default_rng(3)
@@ -297,6 +314,19 @@ def test_any_divisor_of_the_actions(replay, n):
     assert distiller.student.config.num_agents == n
     assert distiller.student.config.mlp_dim == max(512 // n, 50)
     assert np.isfinite(losses).all()
+
+
+def test_hidden_layers_have_50_units_or_more(tmp_path):
+    rng = np.random.default_rng(0)
+    fac.write_npz(tmp_path / "replay.npz", {"kind": "replay"}, {
+        "observation": rng.standard_normal((60, 8)).astype(np.float16),
+        "action": rng.uniform(-1, 1, (60, 12)).astype(np.float16),
+        "continues": np.arange(1, 61) % 10 != 0})
+    expert, config = random_model(1, 12), fac.dataclasses.replace(CONFIG, held_out=0.3)
+    for n, width in ((12, 50), (6, 85)):  # 512 // 12 is 42
+        with contextlib.closing(fac.Distiller(expert, fac.Replay(tmp_path / "replay.npz"), config,
+                                              n)) as distiller:
+            assert distiller.student.config.mlp_dim == width
 
 
 def test_what_diverges_stops(replay):
