@@ -217,6 +217,26 @@ def test_a_student_plays_no_own_episode_twice(replay, tmp_path, monkeypatch):
     assert seen == fac.training_seeds(0, "own episode", 0, 6) and len(set(seen)) == 6
 
 
+def test_a_row_of_the_curve_is_of_the_steps_since_the_last(replay, tmp_path, monkeypatch):
+    found, rates = [], []
+    monkeypatch.setattr(fac, "rank_correlation", lambda *_: (np.arange(4), np.arange(4, 8)))
+    config = fac.dataclasses.replace(CONFIG, steps=24, batch_size=4, warmup=9)
+    with fresh(replay, config) as distiller:
+        step = distiller.step
+
+        def watched():
+            rates.append(fac.learning_rate(config, distiller.t))
+            found.append(step())
+            return found[-1]
+
+        monkeypatch.setattr(distiller, "step", watched)
+        curve, _ = fac.train_student(distiller, tmp_path, {"task": "x"}, fac.PlannerConfig(), 0)
+    assert [row[0] for row in curve] == list(range(3, 25, 3)) and len(found) == 24
+    for row, first in zip(curve, range(0, 24, 3)):
+        np.testing.assert_allclose(row[2:5], np.mean(found[first:first + 3], 0))
+        assert row[5:] == [rates[first + 2], 0, 3, 7]
+
+
 @pytest.mark.parametrize("clip", [True, False])
 def test_perturbed_actions_are_clipped_where_they_should_be(replay, clip):
     with fresh(replay, fac.dataclasses.replace(CONFIG, clip_actions=clip)) as distiller:

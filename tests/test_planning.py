@@ -143,7 +143,7 @@ def test_proposals_are_the_policy_s_actions_and_noise_of_their_own(monkeypatch):
 @pytest.mark.parametrize("n", [1, 3])
 def test_fast_returns_are_equation_2(n, horizon):
     model = random_model(n)
-    config = fac.PlannerConfig(horizon=horizon)
+    config = fac.PlannerConfig(horizon=horizon, discount=0.8)
     rng = np.random.default_rng(1)
     fast = fac.Returns(model)
     for samples in (299, 5):  # two blocks, the last narrower; then buffers of another size
@@ -259,9 +259,13 @@ def test_noisy_actions_of_a_policy_are_clipped():
     assert np.abs(fac.policy_rollout(model, z, [np.float32(2)] * 3)).max() == 1
 
 
-def test_an_observation_of_the_wrong_size_is_refused():
-    with pytest.raises(fac.UserError, match=r"\(8,\), found \(7,\)"):
-        fac.Planner(random_model()).act(np.zeros(7))
+def test_an_observation_of_the_wrong_size_or_without_numbers_is_refused():
+    with fac.Planner(random_model()) as planner:
+        for wrong, text in ((np.zeros(7), r"\(8,\), found \(7,\)"),
+                            (np.full(8, np.nan), "observation: .* not finite"),
+                            (np.r_[np.zeros(7), np.inf], "observation: .* not finite")):
+            with pytest.raises(fac.UserError, match=text):
+                planner.act(wrong)
 
 
 def test_planner_config_refuses_nonsense():
@@ -486,6 +490,18 @@ def misses_a_file(connection):
     open("/nonexistent/file")
 
 
+def tells_its_threads(connection):
+    from threadpoolctl import threadpool_info
+    connection.send([pool["num_threads"] for pool in threadpool_info()
+                     if pool["user_api"] == "blas"])
+
+
+def test_a_worker_s_products_take_one_thread(monkeypatch):
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
+    with fac.Workers(tells_its_threads, 1) as workers:
+        assert set(workers.receive(0)) == {1}
+
+
 def fails(connection):
     raise ZeroDivisionError
 
@@ -529,6 +545,9 @@ def test_returns_that_are_not_finite_are_never_elites(bad):
     with pytest.raises(fac.UserError, match="no action sequence has a finite return"):
         fac.mppi(lambda actions: np.full((2, 64), bad, np.float32), np.zeros_like(target), config,
                  streams(2))
+    with pytest.raises(fac.UserError, match="no action sequence has a finite return"):  # of one
+        fac.mppi(lambda actions: returns(actions) * np.array([[1], [bad]], np.float32),
+                 np.zeros_like(target), config, streams(2))
 
 
 def test_weights_out_of_range_are_an_error_not_an_action():

@@ -57,6 +57,15 @@ def test_the_buffer_drops_the_oldest_and_writes_a_replay(tmp_path, dtype):
     assert set(fac.Replay(tmp_path / "replay.npz").observation[:, 0]) == {3}  # the newest
 
 
+def test_segments_begin_anywhere_in_an_episode():
+    buffer = train_expert.ReplayBuffer(8, 3, fac.EPISODE_STEPS)
+    buffer.add(*episode(np.random.default_rng(0), 1))
+    *_, (_, start) = buffer.sample(np.random.default_rng(0), 5000, 3)
+    drawn, _ = np.histogram(start, 7, (0, 497))  # 498 starts, the last of which is 497
+    assert (start.min(), start.max()) == (0, 497)
+    assert 0.8 < drawn.min() / (5000 / 7) < drawn.max() / (5000 / 7) < 1.2
+
+
 def test_a_replay_is_spread_over_training(tmp_path):
     buffer = train_expert.ReplayBuffer(8, 3, 10 * fac.EPISODE_STEPS)
     for value in range(10):
@@ -252,6 +261,16 @@ def test_exploration_falls_and_no_episode_is_played_twice():
             assert (planning.min_std, planning.horizon) == (pytest.approx(std), horizon)
         seeds += [seed for seed, *_ in found.explorations()]
     assert len(set(seeds)) == len(seeds) == 2 + 3 * 4
+
+
+def test_evaluations_are_of_episodes_apart_and_of_each_model_s_horizon():
+    found = training("--seed", "4", "--evaluate-episodes", "2", "--distill-horizon", "1",
+                     "--std-steps", "0")
+    seeds = fac.episode_seeds(5, 2)  # not those that a run's own evaluation plays in the end
+    assert found.tests() == [(seed, name) for name in ("expert", "student") for seed in seeds]
+    planners = found.planners()
+    assert planners["expert"][1].horizon == 3 and planners["student"][1].horizon == 1
+    assert planners["student"][0] is found.student.model
 
 
 def test_every_update_has_states_and_perturbations_of_its_own(monkeypatch):
