@@ -104,6 +104,12 @@ def test_proposals_compete_in_every_iteration(iterations):
     mean, elites, _ = fac.mppi(quadratic(target), np.zeros_like(target), config, streams(1),
                                target[..., None])
     assert np.array_equal(elites[..., 0], target) and np.allclose(mean, target)
+    config = fac.dataclasses.replace(config, elites=8)
+    around = np.random.default_rng(0).uniform(-1, 1, (1, 2, 1, 20)).astype(np.float32)
+    _, elites, scores = fac.mppi(quadratic(target), mean, config, streams(1), around)
+    assert np.isin(elites, around).any()
+    expected = np.exp(0.5 * quadratic(target)(elites))  # by their returns, as samples do
+    np.testing.assert_allclose(scores, expected / expected.sum(), rtol=1e-5)
 
 
 def test_an_elite_is_drawn_by_its_score_for_each_agent_alone():
@@ -502,6 +508,18 @@ def test_a_worker_s_products_take_one_thread(monkeypatch):
         assert set(workers.receive(0)) == {1}
 
 
+def sleeps(connection):
+    connection.send("soundly")
+    time.sleep(600)
+
+
+def test_a_worker_that_does_not_listen_is_ended():
+    with fac.Workers(sleeps, 1) as workers:
+        assert workers.receive(0) == "soundly"
+        began, ((process, _),) = time.monotonic(), workers._members
+    assert time.monotonic() - began < 30 and process.exitcode == -signal.SIGKILL
+
+
 def fails(connection):
     raise ZeroDivisionError
 
@@ -568,7 +586,7 @@ def test_without_a_seed_every_planner_is_another():
 def test_cores_are_those_this_process_may_use(monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 5, 7}, raising=False)
-    assert fac.cores() == 3 and fac.useful_workers(6) == 2
+    assert fac.cores() == 3 and fac.useful_workers(6) == 2 and fac.useful_workers(2) == 1
     monkeypatch.delattr(os, "sched_getaffinity")
     assert fac.cores() == 64
 

@@ -290,6 +290,24 @@ def test_every_update_has_states_and_perturbations_of_its_own(monkeypatch):
     assert not np.array_equal(*noise)
 
 
+@pytest.mark.parametrize("horizon", [0, 2, 4])  # beside the expert's 3
+def test_expert_and_student_learn_over_their_own_horizons(horizon, monkeypatch):
+    found, seen = training("--distill-horizon", str(horizon), "--distill-grad-clip", "0.5"), []
+    found.buffer.add(*episode(np.random.default_rng(0), 1))
+    update, perturbed, student = found.learner.update, fac.perturbed_batch, found.student
+    monkeypatch.setattr(found.learner, "update", lambda obs, actions, reward, rng: (
+        seen.append((len(obs), len(actions), len(reward))), update(obs, actions, reward, rng))[1])
+    monkeypatch.setattr(fac, "perturbed_batch", lambda *args: (
+        seen.append(len(args[3])), perturbed(*args))[1])
+    step = student.optimizer.step
+    monkeypatch.setattr(student.optimizer, "step", lambda lr, clip: (
+        seen.append((lr, clip)), step(lr, clip))[1])
+    for t in range(2):
+        found.learn()
+        assert seen == [(4, 3, 3), horizon + 1, (fac.learning_rate(student.config, t), 0.5)]
+        seen.clear()
+
+
 def test_evaluations_and_their_ratio_are_of_whom_they_name(monkeypatch, tmp_path):
     found = training("--episodes", "1")
     found.curve = [{"decisions": 500}]
