@@ -72,6 +72,9 @@ def test_a_replay_is_spread_over_training(tmp_path):
         buffer.add(*episode(np.random.default_rng(0), value))
     buffer.write(tmp_path / "replay.npz", {"task": "walker-walk"}, episodes=3)
     assert fac.Replay(tmp_path / "replay.npz").observation[::501, 0].tolist() == [3, 6, 9]
+    buffer.write(tmp_path / "replay.npz", {"task": "reacher-hard"}, episodes=3)
+    found = fac.Replay(tmp_path / "replay.npz").observation
+    assert abs((found[:, 3:5] != found[:, :1]).all(1).mean() - 0.5) < 0.05  # other targets [D6]
 
 
 def test_half_of_a_reacher_replay_s_states_get_another_target():
@@ -306,6 +309,44 @@ def test_expert_and_student_learn_over_their_own_horizons(horizon, monkeypatch):
         found.learn()
         assert seen == [(4, 3, 3), horizon + 1, (fac.learning_rate(student.config, t), 0.5)]
         seen.clear()
+
+
+class Still:
+    """Stands for `Actors`: notes what it is asked for; every episode is of ones."""
+
+    def __init__(self, learner):
+        self.learner, self.played = learner, []
+
+    def begin(self, episodes):
+        self.episodes = episodes
+
+    def play(self, decisions, planners):
+        self.played.append((decisions, self.learner.updates, set(planners)))
+
+    def wait(self):
+        return [episode(np.random.default_rng(0), 1) for _ in self.episodes]
+
+
+def test_a_round_s_episodes_go_on_with_newer_weights_in_every_part():
+    found = training("--refresh", "125")
+    assert found.student.config.steps == 30  # a hundredth of 3,000: the rate falls over these
+    found.decisions, found.allowed, found.curve = 2000, 8.0, [{}]
+    found.buffer.add(*episode(np.random.default_rng(0), 1))
+    actors = Still(found.learner)
+    found.round(actors, SimpleNamespace(update=lambda: None, set_postfix_str=lambda *_: None))
+    playing = {"explorer", "own"}  # and, with the weights that they began with, those tested
+    assert actors.played == [(125, 0, {*playing, "expert", "student"}), (125, 2, playing),
+                             (125, 4, playing), (125, 6, playing)]
+    assert (found.learner.updates, found.allowed, found.decisions) == (8, 18, 3000)
+    assert (len(found.buffer), len(found.student.own)) == (3, 2)
+
+
+def test_the_expert_learns_from_segments_with_other_targets(monkeypatch):
+    found, seen = training("--batch-size", "400"), []
+    found.buffer.add(*episode(np.random.default_rng(0), 1))
+    monkeypatch.setattr(found.learner, "update", lambda obs, *_: seen.append(obs) or [0.0] * 3)
+    found.learn()
+    assert 0.65 < (seen[0][0, 3:5] != 1).all(0).mean() < 0.85  # three quarters [D6]
 
 
 def test_evaluations_and_their_ratio_are_of_whom_they_name(monkeypatch, tmp_path):
