@@ -398,6 +398,20 @@ def test_distill_times_workers_only_where_there_are_cores(cores, seconds, worker
     assert (found["plan_ms_student_in_process"], found["speedup"]) == (2000, 4000 / best)
 
 
+def test_timings_take_turns_and_drop_the_first_round(monkeypatch):
+    """One that takes 9 seconds the first time and 1 later, and one that takes 2."""
+    clock, called, takes = [0.0], [], {"a": [9, 1, 1, 1], "b": [2, 2, 2, 2]}
+
+    def call(name):
+        called.append(name)
+        clock[0] += takes[name].pop(0)
+
+    monkeypatch.setattr(fac.time, "perf_counter", lambda: clock[0])
+    calls = [lambda name=name: call(name) for name in "ab"]
+    assert fac.interleaved_seconds(calls, 3, "timing").tolist() == [[1, 2]] * 3
+    assert "".join(called) == "ab" * 4
+
+
 def test_distill_shows_its_progress(distilled):
     done, _ = distilled
     for part in ("distilling", "loss", "KL reward", "value", "step/s", "evaluating the student",

@@ -16,6 +16,7 @@ import time
 import tracemalloc
 import warnings
 import zipfile
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ import pytest
 import fac_tdmpc_ref as fac
 import import_expert
 from test_data import refusal
+from test_planning import random_model
 
 MIB = 1 << 20
 TASK, SIZES = "reacher-easy", fac.ModelConfig(8, 3, 1, 4, 5, 6)
@@ -807,6 +809,29 @@ def test_the_share_that_is_advised_holds_out_an_episode(tmp_path, episodes):
         "weights": 1, "stored_as": ["float32"], "transitions": 1, "policy": True})
     share = float(text.split("--held-out ")[1].split(",")[0])
     assert len(fac.Replay(tmp_path / "replay.npz").starts(2, share)[1])
+
+
+def test_collected_episodes_differ_in_start_and_noise(monkeypatch):
+    made = []
+
+    class Played:
+        def __init__(self, environment, seed, exploration_std):
+            made.append((seed, exploration_std))
+
+        def play(self, planner, decisions):
+            pass
+
+        def arrays(self):
+            return np.zeros((3, 8)), np.zeros((2, 3)), np.full(2, len(made))
+
+    monkeypatch.setattr(fac, "EPISODE_STEPS", 2)
+    monkeypatch.setattr(import_expert, "Episode", Played)
+    environment = SimpleNamespace(dim_obs=8, dim_action=3)
+    buffer = import_expert.collect(random_model(1), environment, 40, 5)
+    seeds, deviations = zip(*made)
+    assert len(set(seeds)) == len(set(deviations)) == len(buffer) == 40
+    assert 0 <= min(deviations) < 0.1 and 0.4 < max(deviations) <= import_expert.MAX_NOISE
+    assert buffer.reward[:, 0].tolist() == list(range(1, 41))
 
 
 def test_collected_episodes_distil_and_depend_on_the_seed_alone(tmp_path, capsys, monkeypatch):
