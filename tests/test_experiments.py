@@ -370,6 +370,31 @@ def test_a_run_is_distilled_as_it_says(monkeypatch):
     assert (row["rank_q"], row["rank_return"]) == (0, 6)
 
 
+def test_every_method_of_figure_4_learns_from_its_run_s_seed(replay, monkeypatch):
+    monkeypatch.setattr(baselines.ActionVAE, "fit", lambda *_: None)
+    for case, settings in experiments.FIGURE4.items():
+        weights = []
+        for seed in (3, 3, 4):
+            distiller = baselines.distiller_of(case)(random_model(1, policy=True), replay,
+                                                     test_distill.CONFIG,
+                                                     settings.get("num_agents"), seed)
+            distiller.close()
+            weights.append(distiller.optimizer.vector)
+            assert distiller.seed == seed
+        assert np.array_equal(weights[0], weights[1]), case
+        assert not np.array_equal(weights[0], weights[2]), case
+        hidden = {"Fac-TDMPC": 170, "10% TD-MPC": 66}.get(case, 512)  # 512 // 3; B.2's; Table 2's
+        assert distiller.student.config.mlp_dim == hidden, case
+
+
+def test_a_row_holds_the_mean_and_the_least_of_its_returns(monkeypatch):
+    rewards, seen = np.array([[1.0, 2.0], [0.0, 9.0], [5.0, 1.0], [0.0, 0.5]]), []
+    monkeypatch.setattr(fac, "play", lambda *args: (seen.append(args[3]), (0, 0, rewards, 0))[1])
+    found = experiments.measure(None, "x", None, 4)
+    assert (found["return_mean"], found["return_min"]) == (4.625, 0.5)  # of 3, 9, 6 and 0.5
+    assert seen == [fac.episode_seeds(0, 4)]
+
+
 def loss_inputs(dtype=np.float64):
     """A small student, features, actions, targets and the expert's latents."""
     rng = np.random.default_rng(0)
@@ -467,6 +492,15 @@ def test_the_action_vae_against_pytorch():
     assert np.isclose(loss, total.item())
     for key, p in params.items():
         np.testing.assert_allclose(grads[key], p.grad, rtol=1e-9, atol=1e-12)
+
+
+def test_the_action_vae_learns_with_noise(monkeypatch):
+    vae, noise, rng = small_vae(np.float32), [], np.random.default_rng(0)
+    monkeypatch.setattr(vae, "loss", lambda x, drawn, *_: noise.append(drawn))
+    vae.fit(lambda batch: np.zeros((7, batch), np.float32), rng, 20)
+    noise = np.stack(noise)
+    assert noise.shape == (20, 2, 256) and abs(noise.std() - 1) < 0.03 and abs(noise.mean()) < 0.03
+    assert len({step.tobytes() for step in noise}) == 20
 
 
 def test_the_action_vae_finds_a_plane():

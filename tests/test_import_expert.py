@@ -561,6 +561,13 @@ def test_bombs_cost_little(tmp_path, name):
     assert time.process_time() - began < 10
 
 
+def test_a_long_pickle_is_not_even_begun():
+    data = pickle.dumps({}, 2)  # which is fine, as is what follows its end
+    assert import_expert.read_pickle(data, {}, "<") == {}
+    longer = data + bytes(import_expert.MAX_HEADER + 1 - len(data))
+    refusal(lambda: import_expert.read_pickle(longer, {}, "<"), "more than")
+
+
 def test_expansions_of_weights_are_bounded(tmp_path):
     """Every weight a view of one number; sizes whose networks would take gigabytes."""
     for hidden, part in ((6, None), (1 << 13, "weights")):

@@ -104,11 +104,16 @@ def test_proposals_compete_in_every_iteration(iterations):
     mean, elites, _ = fac.mppi(quadratic(target), np.zeros_like(target), config, streams(1),
                                target[..., None])
     assert np.array_equal(elites[..., 0], target) and np.allclose(mean, target)
-    config = fac.dataclasses.replace(config, elites=8)
-    around = np.random.default_rng(0).uniform(-1, 1, (1, 2, 1, 20)).astype(np.float32)
-    _, elites, scores = fac.mppi(quadratic(target), mean, config, streams(1), around)
-    assert np.isin(elites, around).any()
-    expected = np.exp(0.5 * quadratic(target)(elites))  # by their returns, as samples do
+
+
+def test_proposals_are_scored_as_samples_are():
+    target = np.array([[[0.3], [-0.4]]], np.float32)
+    proposals = np.random.default_rng(0).uniform(-1, 1, (1, 2, 1, 20)).astype(np.float32)
+    config = fac.PlannerConfig(samples=20, elites=20, iterations=1)
+    _, elites, scores = fac.mppi(quadratic(target), np.zeros_like(target), config, streams(1),
+                                 proposals)
+    assert 0.2 < np.isin(elites, proposals).mean() < 0.9  # of both kinds
+    expected = np.exp(0.5 * quadratic(target)(elites))
     np.testing.assert_allclose(scores, expected / expected.sum(), rtol=1e-5)
 
 
