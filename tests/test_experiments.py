@@ -367,6 +367,7 @@ def test_a_run_is_distilled_as_it_says(monkeypatch):
     *own, (*last, evaluated) = seen
     assert made == [(3, 5)] and last == [3, 2, 7] and evaluated == fac.episode_seeds(0, 10)
     assert sum((seeds for *_, seeds in own), []) == fac.training_seeds(5, "own episode", 0, 3)
+    assert {samples for _, _, samples, _ in own} == {64} == {fac.OWN_BUDGET["samples"]}
     assert (row["rank_q"], row["rank_return"]) == (0, 6)
 
 
@@ -610,6 +611,15 @@ def test_a_run_is_planned_disturbed_and_timed_as_it_says(monkeypatch, tmp_path):
     assert set(made) == {7} and row["ms"] > 0
     run = experiments.make_run("reacher-hard", 0, "N = 3", num_agents=3)
     assert experiments.fresh_student(run)[0].config.num_agents == 3
+
+
+def test_milliseconds_are_medians_over_rounds(monkeypatch):
+    monkeypatch.setattr(fac, "cores", lambda: 1)
+    monkeypatch.setattr(fac, "interleaved_seconds", lambda calls, rounds, label: np.array(
+        [[0.001], [0.002], [0.009]]))
+    (row,) = experiments.time_runs([experiments.make_run("x", 0, "expert", samples=7)],
+                                   lambda run: (random_model(1), {}), 3)
+    assert row["ms"] == row["ms_workers"] == 2
 
 
 def test_figures_7_and_8_plan_with_both_models(tmp_path, monkeypatch, capsys):
