@@ -611,6 +611,7 @@ def test_what_is_kept_is_the_student_s_return_by_the_expert_s(monkeypatch):
     args = SimpleNamespace(task="x", episodes=2, eval_seed=0, workers=0, evaluate_expert=False)
     found = fac.evaluate_both(None, [9.0, 15.0, 99.0], None, args, None)
     assert (found["kept"], found["expert_return_std"], found["student_return_std"]) == (0.5, 3, 2)
+    assert fac.return_kept(3, 0) is fac.return_kept(3, -1) is None  # nothing to keep
 
 
 def test_what_stops_several_workers_is_said_once(tmp_path, distilled):

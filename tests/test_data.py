@@ -461,6 +461,28 @@ def test_sequences(tmp_path):
             np.testing.assert_array_equal(actions[h, :, b], arrays["action"][start + h])
 
 
+def test_checksums_tell_replays_apart_by_every_array(tmp_path):
+    found, arrays = set(), replay_arrays()
+    later = arrays["continues"].copy()
+    later[9] = False  # one more end
+    for changes in ({}, {"observation": arrays["observation"][::-1]}, {"continues": later},
+                    {"action": arrays["action"][::-1]}):
+        replay = fac.Replay(write_replay(tmp_path / "r.npz", **changes))
+        found.add(tuple(fac.data_checksums(make_model(), replay)))
+    assert len(found) == 4
+    other = make_model()
+    other.params["_Q2.5.bias"] += 1
+    assert fac.data_checksums(other, replay)[0] != fac.data_checksums(make_model(), replay)[0]
+
+
+def test_a_student_s_file_plans_over_what_it_was_distilled_for():
+    """Its expert's discount, and its own horizon before its expert's."""
+    header = {"training": {"discount": 0.9, "horizon": 3, "lr": 1}, "distill": {"horizon": 1}}
+    assert fac.made_for(header, "x") == {"discount": 0.9, "horizon": 1}
+    assert fac.made_for({**header, "distill": None}, "x") == {"discount": 0.9, "horizon": 3}
+    assert fac.made_for({}, "x") == {}
+
+
 # data_file ----------------------------------------------------------------------------
 
 
