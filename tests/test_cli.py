@@ -389,7 +389,7 @@ def test_distill_times_workers_only_where_there_are_cores(cores, seconds, worker
     def timed(calls, rounds, label):
         assert len(calls) == len(seconds)
         assert all(call().shape == (3,) for call in calls)
-        return np.array([seconds])
+        return np.array([seconds, seconds, [9] * len(seconds)])  # the last: a busy machine
 
     monkeypatch.setattr(fac, "cores", lambda: cores)
     monkeypatch.setattr(fac, "interleaved_seconds", timed)
@@ -397,6 +397,20 @@ def test_distill_times_workers_only_where_there_are_cores(cores, seconds, worker
     found = fac.time_both((random_model(1), planning), (random_model(), planning), np.zeros(8))
     assert (found["plan_workers"], found["plan_ms_student"]) == (workers, best)
     assert (found["plan_ms_student_in_process"], found["speedup"]) == (2000, 4000 / best)
+
+
+def test_timings_take_turns_and_drop_the_first_round(monkeypatch):
+    """One that takes 9 seconds the first time and 1 later, and one that takes 2."""
+    clock, called, takes = [0.0], [], {"a": [9, 1, 1, 1], "b": [2, 2, 2, 2]}
+
+    def call(name):
+        called.append(name)
+        clock[0] += takes[name].pop(0)
+
+    monkeypatch.setattr(fac.time, "perf_counter", lambda: clock[0])
+    calls = [lambda name=name: call(name) for name in "ab"]
+    assert fac.interleaved_seconds(calls, 3, "timing").tolist() == [[1, 2]] * 3
+    assert "".join(called) == "ab" * 4
 
 
 def test_distill_shows_its_progress(distilled):
@@ -653,6 +667,7 @@ def test_what_is_kept_is_the_student_s_return_by_the_expert_s(monkeypatch):
     planned = None, fac.PlannerConfig()
     found = fac.evaluate_both(planned, planned, ([9.0, 15.0, 99.0], {}), args)
     assert (found["kept"], found["expert_return_std"], found["student_return_std"]) == (0.5, 3, 2)
+    assert fac.return_kept(3, 0) is fac.return_kept(3, -1) is None  # nothing to keep
 
 
 def test_what_stops_several_workers_is_said_once(tmp_path, distilled):

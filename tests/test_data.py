@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -420,6 +420,7 @@ def test_what_a_replay_holds(tmp_path):
 
 
 @settings(max_examples=60, deadline=None)
+@example(lengths=[5, 5, 5, 5], steps=2, held_out=0.9)  # at least every second one is trained on
 @given(lengths=st.lists(st.integers(1, 9), min_size=1, max_size=12), steps=st.integers(1, 5),
        held_out=st.sampled_from([0.01, 0.05, 0.2, 0.3, 0.5, 0.9]))
 def test_starts_stay_in_their_episode_and_no_episode_serves_both(lengths, steps, held_out):
@@ -458,6 +459,28 @@ def test_sequences(tmp_path):
         np.testing.assert_array_equal(obs[:, b], arrays["observation"][start])
         for h in range(4):
             np.testing.assert_array_equal(actions[h, :, b], arrays["action"][start + h])
+
+
+def test_checksums_tell_replays_apart_by_every_array(tmp_path):
+    found, arrays = set(), replay_arrays()
+    later = arrays["continues"].copy()
+    later[9] = False  # one more end
+    for changes in ({}, {"observation": arrays["observation"][::-1]}, {"continues": later},
+                    {"action": arrays["action"][::-1]}):
+        replay = fac.Replay(write_replay(tmp_path / "r.npz", **changes))
+        found.add(tuple(fac.data_checksums(make_model(), replay)))
+    assert len(found) == 4
+    other = make_model()
+    other.params["_Q2.5.bias"] += 1
+    assert fac.data_checksums(other, replay)[0] != fac.data_checksums(make_model(), replay)[0]
+
+
+def test_a_student_s_file_plans_over_what_it_was_distilled_for():
+    """Its expert's discount, and its own horizon before its expert's."""
+    header = {"training": {"discount": 0.9, "horizon": 3, "lr": 1}, "distill": {"horizon": 1}}
+    assert fac.made_for(header, "x") == {"discount": 0.9, "horizon": 1}
+    assert fac.made_for({**header, "distill": None}, "x") == {"discount": 0.9, "horizon": 3}
+    assert fac.made_for({}, "x") == {}
 
 
 # data_file ----------------------------------------------------------------------------

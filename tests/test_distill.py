@@ -114,6 +114,27 @@ def test_a_standard_error_is_of_groups_not_of_what_is_in_them():
     assert fac.standard_error(each, np.zeros(6)) is None
 
 
+def test_rank_correlations_are_over_32_sequences_discounted_as_planned(replay, monkeypatch):
+    distiller, copies = distilled(replay, CONFIG, 0)[0], []
+    weights = distiller.optimizer.vector  # of which some begin at zero
+    weights += 0.1 * np.random.default_rng(0).standard_normal(len(weights))
+
+    def watched(expert, student, obs, around, *rest):
+        features, actions, predictions = fac.perturbed_batch(expert, student, obs, around, *rest)
+        copies.append(actions.shape[3])
+        for state, sequence in zip(obs.T, around[..., 0].transpose(2, 0, 1)):
+            ((row, *_),) = np.nonzero((replay.observation == state).all(1))
+            assert np.array_equal(replay.action[row:row + 4], sequence)  # what was done there
+        return features, actions, predictions
+
+    monkeypatch.setattr(distiller, "perturb", watched)
+    _, of_rewards, *_ = fac.rank_correlation(distiller, 16, 0.0)
+    assert set(copies) == {32}
+    assert (of_rewards[1:] == of_rewards[1]).all() and of_rewards[0] != of_rewards[1]
+    _, of_returns, *_ = fac.rank_correlation(distiller, 16, 0.9)
+    assert len(set(of_returns)) == 4 and of_returns[0] == of_rewards[0]  # Q alone
+
+
 def test_rank_correlations_are_spearman_s():
     from scipy.stats import spearmanr
     x = np.random.default_rng(0).standard_normal((3, 9))
@@ -121,8 +142,10 @@ def test_rank_correlations_are_spearman_s():
     np.testing.assert_allclose(fac.spearman(x, y), [spearmanr(a, b)[0] for a, b in zip(x, y)])
 
 
-def test_same_seed_same_student(replay):
-    students = [distilled(replay, CONFIG, 5, seed=seed)[0].optimizer.vector for seed in (1, 1, 2)]
+@pytest.mark.parametrize("steps", [0, 5])
+def test_same_seed_same_student(replay, steps):
+    students = [distilled(replay, CONFIG, steps, seed=seed)[0].optimizer.vector
+                for seed in (1, 1, 2)]
     assert np.array_equal(students[0], students[1])
     assert not np.array_equal(students[0], students[2])
 
@@ -206,6 +229,17 @@ def test_a_student_s_own_actions_begin_where_their_state_is(replay):
     assert 0.35 < played.mean() < 0.65  # the others' are the policy's [D8]
 
 
+def test_own_states_are_drawn_from_all_of_all_own_episodes(replay):
+    (obs, action), count = ramp(), 2000
+    config = fac.dataclasses.replace(CONFIG, encoder_input="observation", own_share=1.0,
+                                     noise_samples=2)
+    with fresh(replay, config) as distiller:
+        distiller.add(np.stack([obs[:-1], -obs[:-1]]), np.stack([action, action]))
+        (features,), _, _ = distiller.draw(0, 0, count)
+    drawn, _ = np.histogram(features[0], 8, (-496, 496))  # a quarter of an episode each
+    assert drawn.sum() == count and drawn.min() > 0.7 * count / 8 and drawn.max() < 1.3 * count / 8
+
+
 def test_a_student_plays_no_own_episode_twice(replay, tmp_path, monkeypatch):
     seen = []
     monkeypatch.setattr(fac, "play", lambda model, task, planning, seeds, *_: (
@@ -217,10 +251,45 @@ def test_a_student_plays_no_own_episode_twice(replay, tmp_path, monkeypatch):
     assert seen == fac.training_seeds(0, "own episode", 0, 6) and len(set(seen)) == 6
 
 
+def test_a_row_of_the_curve_is_of_the_steps_since_the_last(replay, tmp_path, monkeypatch):
+    found, rates = [], []
+    monkeypatch.setattr(fac, "rank_correlation", lambda *_: (np.arange(4), np.arange(4, 8)))
+    config = fac.dataclasses.replace(CONFIG, steps=24, batch_size=4, warmup=9)
+    with fresh(replay, config) as distiller:
+        step = distiller.step
+
+        def watched():
+            rates.append(fac.learning_rate(config, distiller.t))
+            found.append(step())
+            return found[-1]
+
+        monkeypatch.setattr(distiller, "step", watched)
+        curve, _ = fac.train_student(distiller, tmp_path, {"task": "x"}, fac.PlannerConfig(), 0)
+    assert [row[0] for row in curve] == list(range(3, 25, 3)) and len(found) == 24
+    for row, first in zip(curve, range(0, 24, 3)):
+        np.testing.assert_allclose(row[2:5], np.mean(found[first:first + 3], 0))
+        assert row[5:] == [rates[first + 2], 0, 3, 7]
+
+
 @pytest.mark.parametrize("clip", [True, False])
 def test_perturbed_actions_are_clipped_where_they_should_be(replay, clip):
     with fresh(replay, fac.dataclasses.replace(CONFIG, clip_actions=clip)) as distiller:
         assert (np.abs(distiller.draw(0, 0, 64)[1]).max() <= 1) == clip
+
+
+def test_perturbations_are_of_their_deviation_and_each_its_own(replay):
+    config = fac.dataclasses.replace(CONFIG, noise_std=0.3, noise_samples=50, clip_actions=False)
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (4, 3, 20, 1)).astype(np.float32)
+    with fresh(replay, config) as distiller:
+        _, perturbed, _ = fac.perturbed_batch(distiller.expert, distiller.student,
+                                              np.zeros((8, 20), np.float32), actions, config, rng)
+    noise = perturbed - actions
+    assert noise.shape == (4, 3, 20, 50)
+    assert abs(noise.std() / 0.3 - 1) < 0.03 and abs(noise.mean()) < 0.02
+    for axis in range(4):  # of step, dimension, state and copy
+        one, two = np.moveaxis(noise, axis, 0)[:2]
+        assert abs(np.corrcoef(one.ravel(), two.ravel())[0, 1]) < 0.2
 
 
 def test_no_two_parts_of_a_pool_share_perturbations(replay):
@@ -269,6 +338,18 @@ def test_a_step_in_halves_is_the_step_of_the_whole(replay, batch):
     np.testing.assert_allclose(seen[0], gradient, rtol=1e-3, atol=1e-5 * np.abs(gradient).max())
 
 
+def test_a_step_learns_at_its_rate_and_clips_its_gradient(replay, monkeypatch):
+    config, seen = fac.dataclasses.replace(CONFIG, grad_clip=0.5), []
+    with fresh(replay, config) as distiller:
+        step = distiller.optimizer.step
+        monkeypatch.setattr(distiller.optimizer, "step",
+                            lambda lr, clip: seen.append((lr, clip)) or step(lr, clip))
+        for _ in range(3):
+            distiller.step()
+    assert seen == [(fac.learning_rate(config, t), 0.5) for t in range(3)]
+    assert len({lr for lr, _ in seen}) == 3
+
+
 def test_returns_over_every_horizon_are_equation_2():
     """What the rank correlation of G is taken of, against what planning uses."""
     model, rng = random_model(), np.random.default_rng(3)
@@ -287,6 +368,19 @@ def test_any_divisor_of_the_actions(replay, n):
     assert distiller.student.config.num_agents == n
     assert distiller.student.config.mlp_dim == max(512 // n, 50)
     assert np.isfinite(losses).all()
+
+
+def test_hidden_layers_have_50_units_or_more(tmp_path):
+    rng = np.random.default_rng(0)
+    fac.write_npz(tmp_path / "replay.npz", {"kind": "replay"}, {
+        "observation": rng.standard_normal((60, 8)).astype(np.float16),
+        "action": rng.uniform(-1, 1, (60, 12)).astype(np.float16),
+        "continues": np.arange(1, 61) % 10 != 0})
+    expert, config = random_model(1, 12), fac.dataclasses.replace(CONFIG, held_out=0.3)
+    for n, width in ((12, 50), (6, 85)):  # 512 // 12 is 42
+        with contextlib.closing(fac.Distiller(expert, fac.Replay(tmp_path / "replay.npz"), config,
+                                              n)) as distiller:
+            assert distiller.student.config.mlp_dim == width
 
 
 def test_what_diverges_stops(replay):

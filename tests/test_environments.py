@@ -220,6 +220,14 @@ def test_evaluation_seeds_are_distinct_and_do_not_depend_on_how_many():
     assert not set(seeds) & set(fac.episode_seeds(1, 50))
 
 
+def test_training_seeds_are_apart_for_each_run_and_use():
+    of_one = fac.training_seeds(0, "own episode", 0, 6)
+    assert of_one[2:5] == fac.training_seeds(0, "own episode", 2, 3)
+    others = [fac.training_seeds(seed, use, 0, 6) for seed, use in (
+        (0, "training episode"), (1, "own episode"), (1, "training episode"))]
+    assert len(set(sum(others, of_one))) == 4 * 6
+
+
 # importing MuJoCo ---------------------------------------------------------------------
 
 

@@ -171,6 +171,22 @@ def test_the_averages_follow_every_second_update():
     assert learner.slow_vector.dtype == learner.optimizer.vector.dtype == np.float32
 
 
+def test_a_learner_goes_on_from_its_state():
+    """Weights, both of Adam's means, steps made and moving averages."""
+    first, second = (small_learner(np.random.default_rng(seed), np.float32) for seed in (6, 7))
+    for t in range(3):
+        first.update(*small_batch(np.random.default_rng(t), dtype=np.float32),
+                     np.random.default_rng(t))
+    second.load({k: np.copy(v) for k, v in first.state().items()})
+    for learner in (first, second):
+        learner.update(*small_batch(np.random.default_rng(9), dtype=np.float32),
+                       np.random.default_rng(9))
+    ours, theirs = first.state(), second.state()
+    assert ours.keys() == theirs.keys() and first.updates == second.updates == 4
+    for key, value in ours.items():
+        assert np.array_equal(value, theirs[key]), key
+
+
 def test_the_policy_s_noise_is_constant_and_cut():
     """TD-MPC's: deviation 0.05, whatever the exploration's is by then; no more than 0.3."""
     noise = fac.policy_noise((200_000,), np.random.default_rng(0))

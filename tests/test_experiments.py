@@ -398,7 +398,33 @@ def test_a_run_is_distilled_as_it_says(monkeypatch):
     *own, (*last, evaluated) = seen
     assert made == [(3, 5)] and last == [3, 2, 7] and evaluated == fac.episode_seeds(0, 10)
     assert sum((seeds for *_, seeds in own), []) == fac.training_seeds(5, "own episode", 0, 3)
+    assert {samples for _, _, samples, _ in own} == {64} == {fac.OWN_BUDGET["samples"]}
     assert (row["rank_q"], row["rank_return"]) == (0, 6)
+
+
+def test_every_method_of_figure_4_learns_from_its_run_s_seed(replay, monkeypatch):
+    monkeypatch.setattr(baselines.ActionVAE, "fit", lambda *_: None)
+    for case, settings in experiments.FIGURE4.items():
+        weights = []
+        for seed in (3, 3, 4):
+            distiller = baselines.distiller_of(case)(random_model(1, policy=True), replay,
+                                                     test_distill.CONFIG,
+                                                     settings.get("num_agents"), seed)
+            distiller.close()
+            weights.append(distiller.optimizer.vector)
+            assert distiller.seed == seed
+        assert np.array_equal(weights[0], weights[1]), case
+        assert not np.array_equal(weights[0], weights[2]), case
+        hidden = {"Fac-TDMPC": 170, "10% TD-MPC": 66}.get(case, 512)  # 512 // 3; B.2's; Table 2's
+        assert distiller.student.config.mlp_dim == hidden, case
+
+
+def test_a_row_holds_the_mean_and_the_least_of_its_returns(monkeypatch):
+    rewards, seen = np.array([[1.0, 2.0], [0.0, 9.0], [5.0, 1.0], [0.0, 0.5]]), []
+    monkeypatch.setattr(fac, "play", lambda *args: (seen.append(args[3]), (0, 0, rewards, 0))[1])
+    found = experiments.measure(None, "x", None, 4)
+    assert (found["return_mean"], found["return_min"]) == (4.625, 0.5)  # of 3, 9, 6 and 0.5
+    assert seen == [fac.episode_seeds(0, 4)]
 
 
 def loss_inputs(dtype=np.float64):
@@ -513,6 +539,15 @@ def test_the_action_vae_against_pytorch():
         np.testing.assert_allclose(grads[key], p.grad, rtol=1e-9, atol=1e-12)
 
 
+def test_the_action_vae_learns_with_noise(monkeypatch):
+    vae, noise, rng = small_vae(np.float32), [], np.random.default_rng(0)
+    monkeypatch.setattr(vae, "loss", lambda x, drawn, *_: noise.append(drawn))
+    vae.fit(lambda batch: np.zeros((7, batch), np.float32), rng, 20)
+    noise = np.stack(noise)
+    assert noise.shape == (20, 2, 256) and abs(noise.std() - 1) < 0.03 and abs(noise.mean()) < 0.03
+    assert len({step.tobytes() for step in noise}) == 20
+
+
 def test_the_action_vae_finds_a_plane():
     """Actions in a plane through a point that the state tells come back from two numbers."""
     rng = np.random.default_rng(0)
@@ -591,6 +626,19 @@ def test_a_disturbed_robot():
     assert np.array_equal(servos[1][0], servos[0][0])
 
 
+def test_figure_8_s_noise_is_a_standard_normal_cut_at_the_limits(monkeypatch):
+    seen, action = [], np.full(3, 0.25, np.float32)
+    monkeypatch.setattr(fac.Environment, "step", lambda self, action: seen.append(action))
+    environment = experiments.DisturbedEnvironment("reacher-hard", 1, "noise")
+    for _ in range(4000):
+        environment.step(action)
+    others, noise = np.delete(seen, 1, 1), np.array(seen)[:, 1]
+    assert (others == 0.25).all() and (action == 0.25).all()
+    assert (np.abs(noise) <= 1).all() and abs(noise.mean()) < 0.05
+    assert abs((np.abs(noise) == 1).mean() - 0.317) < 0.03  # beyond one deviation
+    assert abs(np.corrcoef(noise[1:], noise[:-1])[0, 1]) < 0.06
+
+
 def test_a_run_is_planned_disturbed_and_timed_as_it_says(monkeypatch, tmp_path):
     seen, made, planner = [], [], fac.Planner
     monkeypatch.setattr(experiments, "measure", lambda *args: seen.append(args) or {})
@@ -607,6 +655,15 @@ def test_a_run_is_planned_disturbed_and_timed_as_it_says(monkeypatch, tmp_path):
     assert set(made) == {7} and row["ms"] > 0
     run = experiments.make_run("reacher-hard", 0, "N = 3", num_agents=3)
     assert experiments.fresh_student(run)[0].config.num_agents == 3
+
+
+def test_milliseconds_are_medians_over_rounds(monkeypatch):
+    monkeypatch.setattr(fac, "cores", lambda: 1)
+    monkeypatch.setattr(fac, "interleaved_seconds", lambda calls, rounds, label: np.array(
+        [[0.001], [0.002], [0.009]]))
+    (row,) = experiments.time_runs([experiments.make_run("x", 0, "expert", samples=7)],
+                                   lambda run: (random_model(1), {}), 3)
+    assert row["ms"] == row["ms_workers"] == 2
 
 
 def test_figures_7_and_8_plan_with_both_models(tmp_path, monkeypatch, capsys):

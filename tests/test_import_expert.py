@@ -16,6 +16,7 @@ import time
 import tracemalloc
 import warnings
 import zipfile
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ import pytest
 import fac_tdmpc_ref as fac
 import import_expert
 from test_data import refusal
+from test_planning import random_model
 
 MIB = 1 << 20
 TASK, SIZES = "reacher-easy", fac.ModelConfig(8, 3, 1, 4, 5, 6)
@@ -559,6 +561,13 @@ def test_bombs_cost_little(tmp_path, name):
     assert time.process_time() - began < 10
 
 
+def test_a_long_pickle_is_not_even_begun():
+    data = pickle.dumps({}, 2)  # which is fine, as is what follows its end
+    assert import_expert.read_pickle(data, {}, "<") == {}
+    longer = data + bytes(import_expert.MAX_HEADER + 1 - len(data))
+    refusal(lambda: import_expert.read_pickle(longer, {}, "<"), "more than")
+
+
 def test_expansions_of_weights_are_bounded(tmp_path):
     """Every weight a view of one number; sizes whose networks would take gigabytes."""
     for hidden, part in ((6, None), (1 << 13, "weights")):
@@ -846,6 +855,29 @@ def test_an_action_repeat_goes_with_the_files_through_distill_and_evaluate(tmp_p
     assert fac.made_for(header, "student.npz")["action_repeat"] == 4
     header["action_repeat"] = 7
     refusal(lambda: fac.made_for(header, "student.npz"), "student.npz: header: action_repeat")
+
+
+def test_collected_episodes_differ_in_start_and_noise(monkeypatch):
+    made = []
+
+    class Played:
+        def __init__(self, environment, seed, exploration_std):
+            made.append((seed, exploration_std))
+
+        def play(self, planner, decisions):
+            pass
+
+        def arrays(self):
+            return np.zeros((3, 8)), np.zeros((2, 3)), np.full(2, len(made))
+
+    monkeypatch.setattr(fac, "EPISODE_STEPS", 2)
+    monkeypatch.setattr(import_expert, "Episode", Played)
+    environment = SimpleNamespace(dim_obs=8, dim_action=3)
+    buffer = import_expert.collect(random_model(1), environment, 40, 5)
+    seeds, deviations = zip(*made)
+    assert len(set(seeds)) == len(set(deviations)) == len(buffer) == 40
+    assert 0 <= min(deviations) < 0.1 and 0.4 < max(deviations) <= import_expert.MAX_NOISE
+    assert buffer.reward[:, 0].tolist() == list(range(1, 41))
 
 
 def test_collected_episodes_distil_and_depend_on_the_seed_alone(tmp_path, capsys, monkeypatch):

@@ -165,9 +165,20 @@ def test_orthogonal():
         assert np.allclose(product, np.eye(min(rows, columns)))
 
 
+def test_orthogonal_matrices_are_uniform_over_rotations():
+    """No entry has a sign of its own, as QR's have: they are even, and each agent's are others."""
+    for rows, columns in ((5, 3), (3, 5), (4, 4)):
+        W = fac.orthogonal(np.random.default_rng(9), 600, rows, columns)
+        assert np.abs(W.mean(0)).max() < 0.1 and W.std(0).min() > 0.35
+        assert abs((W > 0).mean(0) - 0.5).max() < 0.1
+
+
 def test_create_follows_told():
     sizes = fac.ModelConfig(8, 3, 3, 50, 256, 170)
     params = fac.WorldModel.create(sizes, np.random.default_rng(0)).params
+    small = fac.ModelConfig(8, 3, 1, 6, 7, 8)
+    policy = fac.WorldModel.create(small, np.random.default_rng(0), policy=True).params
+    assert policy["_pi.4.weight"].any()  # alone of the last layers
     assert all(v.dtype == np.float32 for v in params.values())
     assert all(not params[f"{name}.weight"].any() for name in ("_reward.4", "_Q1.5", "_Q2.5"))
     assert all(not v.any() for k, v in params.items() if k.endswith("bias"))
@@ -220,7 +231,21 @@ def test_every_range_is_checked(kind):
                  (("least", -1), ("above", 0), ("most", 1)) if bound in f.metadata]
         wrong += [np.nan, np.inf] * isinstance(f.default, float)
         wrong += ["sideways"] * ("choices" in f.metadata)
+        wrong += [10 ** 9 + 1] * (type(f.default) is int)
         for value in wrong:
             with pytest.raises(fac.UserError, match=f"{f.name} must be"):
                 kind(**{f.name: value})
         assert f.metadata["help"]
+
+
+def test_settings_hold_python_s_own_numbers():
+    """A whole number, or NumPy's, for a decimal one makes no other name in records and CSVs."""
+    found = fac.PlannerConfig(discount=1, samples=np.int64(64), max_std=np.float32(2))
+    assert repr(found) == repr(fac.PlannerConfig(discount=1.0, samples=64, max_std=2.0))
+
+
+def test_one_number_that_is_not_finite_is_divergence():
+    fac.check_finite({"loss is": [1.0, 2.0], "weights are": np.ones(3)}, 5, 1e-3)
+    for values in ({"loss is": [1.0, np.nan]}, {"loss is": [1.0], "weights are": [1, -np.inf]}):
+        with pytest.raises(fac.UserError, match=f"update 5 the {[*values][-1]} no longer finite"):
+            fac.check_finite(values, 5, 1e-3)

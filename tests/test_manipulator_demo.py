@@ -165,8 +165,9 @@ def test_table_1():
     config = demo.TABLE_1
     assert (config.iterations, config.samples, config.elites, config.horizon) == (6, 50, 5, 4)
     assert (config.min_std, config.max_std, config.inverse_temperature) == (0.05, 2.0, 0.5)
-    assert demo.planner_config(
-        demo.make_parser().parse_args(["--samples", "3"])) == replace(config, samples=3, elites=3)
+    for flags, expected in (([], config), (["--samples", "3"], replace(config, samples=3,
+                                                                       elites=3))):
+        assert demo.planner_config(demo.make_parser().parse_args(flags)) == expected
 
 
 @pytest.mark.parametrize("discount", [0.0, 0.7, 1.0])
@@ -227,6 +228,12 @@ def test_agents_do_not_disturb_each_other():
     np.testing.assert_array_equal(one[:, :2], other[:, :2])
     assert (one[:, 2] != other[:, 2]).any()
     assert np.abs(one).max() <= 1
+
+
+def test_no_two_agents_draw_the_same_numbers():
+    run = demo.Run("", demo.JointModel(), demo.TABLE_1, seed=5)
+    drawn = np.array([rng.standard_normal(1000) for rng in run.rngs])
+    assert drawn.shape == (3, 1000) and np.abs(np.corrcoef(drawn) - np.eye(3)).max() < 0.15
 
 
 def test_executed_action_is_drawn_by_score(monkeypatch):
@@ -301,6 +308,8 @@ def test_measures_of_a_known_path():
     run.seconds = [0.001, 0.002, 0.004]
     result = demo.measure(run)
     assert result["plan_ms_median"] == pytest.approx(2.0)
+    assert result["plan_ms_p10"] == pytest.approx(1.2)  # of 1, 2 and 4
+    assert result["plan_ms_p90"] == pytest.approx(3.6)
     assert result["joint_travel"] == pytest.approx(0.03)
     assert result["joint_net"] == pytest.approx([0.01, 0, 0])
     chord = 2 * 35 * math.sin(0.005)  # of a straight arm of 35 turned by 0.01
@@ -308,6 +317,10 @@ def test_measures_of_a_known_path():
     expected = (chord * 2 * math.sin(0.005) + 2 * chord) / 2  # one bend of 0.01, one turn back
     assert result["bend_step"] == pytest.approx(expected)
     assert result["bend_second"] is None  # shorter than two seconds
+    longer = demo.Run("", demo.JointModel(), demo.TABLE_1, seed=0)
+    longer.theta = [np.array([0.001 * step**2, 0, 0]) for step in range(31)]
+    longer.seconds, tip = [0.001], demo.forward_kinematics(np.stack(longer.theta, axis=1))
+    assert demo.measure(longer)["bend_second"] == demo.bend(tip, 10) != demo.bend(tip, 5)
     assert result["final_distance"] == pytest.approx(
         math.hypot(35 * math.cos(0.01) - 10, 35 * math.sin(0.01) + 25))
 
@@ -348,6 +361,20 @@ def test_the_search_space_names_who_searched():
     args = demo.make_parser().parse_args(["--steps", "1", "--ik", "closed-form"])
     _, result = demo.run_demo(args, demo.planner_config(args))
     assert all(row["three_agents"] > row["one_agent"] for row in result["search_space"][:3])
+
+
+@pytest.mark.parametrize("ik, parts", [
+    ("jacobian-transpose", {"solver": 6, "kinematics": 5, "agents": 2}),
+    ("closed-form", {"kinematics": 5, "agents": 2})])
+def test_the_speed_up_s_parts_name_what_the_next_run_does_without(ik, parts, monkeypatch):
+    ms = {"centralized, authors' IK": 60, "centralized, closed form": 10,
+          "joint angles, one agent": 2, "factored, three agents": 1}
+    monkeypatch.setattr(demo.Run, "step", lambda run: None)
+    monkeypatch.setattr(demo, "measure", lambda run: {"plan_ms_median": ms[run.label]})
+    monkeypatch.setattr(demo, "step_share", lambda *_: 1.0)
+    args = demo.make_parser().parse_args(["--steps", "1", "--ik", ik])
+    _, result = demo.run_demo(args, demo.TABLE_1)
+    assert result["speedup_parts"] == parts and result["speedup"] == math.prod(parts.values())
 
 
 def test_equations_14_to_18_are_the_derivatives():
@@ -424,6 +451,10 @@ def test_goal_map():
     share = demo.goal_map(np.random.default_rng(0))
     x, y = np.meshgrid(np.linspace(-35, 35, 60), np.linspace(-35, 35, 60))
     assert np.isnan(share[np.hypot(x, y) > 35.1]).all() and np.isfinite(share).mean() > 0.5
+    some = np.s_[::7, ::3]  # where the authors' solver gets, and only there
+    goals = np.stack([x[some].ravel(), y[some].ravel()])
+    missed = np.hypot(*(demo.forward_kinematics(demo.inverse_kinematics(goals)) - goals)) > 0.01
+    np.testing.assert_array_equal(np.isnan(share[some]).ravel(), missed)
     assert 0 < np.nanmin(share) and np.nanmax(share) < 1
     row, column = np.unravel_index(np.argmin(np.hypot(x - 10, y + 25)), x.shape)
     assert share[row, column] == pytest.approx(0.28, abs=0.1)  # the paper's goal: y first, then x

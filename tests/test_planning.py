@@ -97,19 +97,65 @@ def test_an_iteration_by_hand(least):
                                atol=1e-6)
 
 
-def test_proposals_compete():
+@pytest.mark.parametrize("iterations", [1, 2, 3])
+def test_proposals_compete_in_every_iteration(iterations):
+    """No sample hits the optimum, so that where it is the last elite it was proposed there."""
     target = np.array([[[0.3], [-0.4]]], np.float32)
-    config = fac.PlannerConfig(samples=8, elites=1, iterations=1, momentum=0.0)
-    mean, _, _ = fac.mppi(quadratic(target), np.zeros_like(target), config, streams(1),
-                          target[..., None])
-    assert np.allclose(mean, target)
+    config = fac.PlannerConfig(samples=8, elites=1, iterations=iterations, momentum=0.0)
+    mean, elites, _ = fac.mppi(quadratic(target), np.zeros_like(target), config, streams(1),
+                               target[..., None])
+    assert np.array_equal(elites[..., 0], target) and np.allclose(mean, target)
+
+
+def test_proposals_are_scored_as_samples_are():
+    target = np.array([[[0.3], [-0.4]]], np.float32)
+    proposals = np.random.default_rng(0).uniform(-1, 1, (1, 2, 1, 20)).astype(np.float32)
+    config = fac.PlannerConfig(samples=20, elites=20, iterations=1)
+    _, elites, scores = fac.mppi(quadratic(target), np.zeros_like(target), config, streams(1),
+                                 proposals)
+    assert 0.2 < np.isin(elites, proposals).mean() < 0.9  # of both kinds
+    expected = np.exp(0.5 * quadratic(target)(elites))
+    np.testing.assert_allclose(scores, expected / expected.sum(), rtol=1e-5)
+
+
+def test_an_elite_is_drawn_by_its_score_for_each_agent_alone():
+    scores = np.array([[0.1, 0.2, 0.3, 0.4], [0.7, 0.0, 0.1, 0.2]], np.float32)
+    elites = np.full((2, 3, 2, 4), 9, np.float32)  # (N, L, d, E)
+    elites[:, 0] = np.arange(4) + 10 * np.arange(2)[:, None]  # 0 to 3, 10 to 13
+    rngs = streams(2)
+    drawn = np.array([fac.draw_elite(elites, scores, rngs) for _ in range(4000)])
+    assert np.array_equal(drawn[:, :, 1], drawn[:, :, 0] + 10)  # both dimensions, of one elite
+    for chosen, score in zip(drawn[:, :, 0].astype(int).T, scores):
+        np.testing.assert_allclose(np.bincount(chosen, minlength=4) / 4000, score, atol=0.03)
+    assert abs(np.corrcoef(drawn[:, :, 0].T)[0, 1]) < 0.1
+
+
+def test_proposals_are_the_policy_s_actions_and_noise_of_their_own(monkeypatch):
+    """Rolled out in the model: what is left where the policy's mean is taken away."""
+    model, seen = random_model(1, policy=True), []
+    for part in ("weight", "bias"):
+        model.params[f"_pi.4.{part}"] *= 0.05  # small actions, which are not clipped
+    monkeypatch.setattr(fac, "mppi", lambda returns, mean, config, rngs, proposals: (
+        seen.append(proposals), (mean, mean[..., None], np.ones((1, 1))))[1])
+    config = fac.PlannerConfig(samples=8, iterations=1, horizon=2, pi_trajs=300)
+    fac.Planner(model, config).act(np.ones(8))
+    ((proposals,),) = seen
+    z, noise = np.repeat(model.encode(np.ones((8, 1), np.float32)), 300, 2), []
+    for a in proposals:
+        mean = model.policy(z)[0]
+        noise.append(a - mean)
+        z = model.next(z, a[None])
+    assert np.shape(noise) == (3, 3, 300) and 0.01 < np.abs(mean).max() < 0.7
+    for h in noise:
+        np.testing.assert_allclose(h.std(1), fac.POLICY_STD, rtol=0.2)
+    assert np.abs(np.corrcoef(np.reshape(noise, (9, -1))) - np.eye(9)).max() < 0.3
 
 
 @pytest.mark.parametrize("horizon", [3, 1, 0])
 @pytest.mark.parametrize("n", [1, 3])
 def test_fast_returns_are_equation_2(n, horizon):
     model = random_model(n)
-    config = fac.PlannerConfig(horizon=horizon)
+    config = fac.PlannerConfig(horizon=horizon, discount=0.8)
     rng = np.random.default_rng(1)
     fast = fac.Returns(model)
     for samples in (299, 5):  # two blocks, the last narrower; then buffers of another size
@@ -182,14 +228,16 @@ def test_warm_start_shifts_by_one():
     assert not planner.mean.any()
 
 
-def test_the_mean_is_executed_where_it_is_asked_for():
+@pytest.mark.parametrize("output", ["mean", "sampled"])
+def test_what_is_executed_is_what_is_asked_for(output):
     model = random_model()
-    config = fac.PlannerConfig(samples=32, iterations=1, horizon=2, output="mean")
+    config = fac.PlannerConfig(samples=32, iterations=1, horizon=2, output=output)
     planner, z = fac.AgentPlanner(model, config), model.encode(np.zeros((8, 1), np.float32))
     planner.reset(np.random.SeedSequence(0).spawn(3))
     twin = [np.random.Generator(np.random.SFC64(s)) for s in np.random.SeedSequence(0).spawn(3)]
-    mean, _, _ = fac.mppi(fac.Returns(model).start(z, config), planner.mean, config, twin)
-    assert np.array_equal(planner.plan(z), mean[:, 0])
+    mean, *elites = fac.mppi(fac.Returns(model).start(z, config), planner.mean, config, twin)
+    expected = mean[:, 0] if output == "mean" else fac.draw_elite(*elites, twin)
+    assert np.array_equal(planner.plan(z), expected)
 
 
 @pytest.mark.parametrize("output", ["sampled", "mean"])
@@ -223,9 +271,13 @@ def test_noisy_actions_of_a_policy_are_clipped():
     assert np.abs(fac.policy_rollout(model, z, [np.float32(2)] * 3)).max() == 1
 
 
-def test_an_observation_of_the_wrong_size_is_refused():
-    with pytest.raises(fac.UserError, match=r"\(8,\), found \(7,\)"):
-        fac.Planner(random_model()).act(np.zeros(7))
+def test_an_observation_of_the_wrong_size_or_without_numbers_is_refused():
+    with fac.Planner(random_model()) as planner:
+        for wrong, text in ((np.zeros(7), r"\(8,\), found \(7,\)"),
+                            (np.full(8, np.nan), "observation: .* not finite"),
+                            (np.r_[np.zeros(7), np.inf], "observation: .* not finite")):
+            with pytest.raises(fac.UserError, match=text):
+                planner.act(wrong)
 
 
 def test_planner_config_refuses_nonsense():
@@ -493,6 +545,30 @@ def misses_a_file(connection):
     open("/nonexistent/file")
 
 
+def tells_its_threads(connection):
+    from threadpoolctl import threadpool_info
+    connection.send([pool["num_threads"] for pool in threadpool_info()
+                     if pool["user_api"] == "blas"])
+
+
+def test_a_worker_s_products_take_one_thread(monkeypatch):
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
+    with fac.Workers(tells_its_threads, 1) as workers:
+        assert set(workers.receive(0)) == {1}
+
+
+def sleeps(connection):
+    connection.send("soundly")
+    time.sleep(20)
+
+
+def test_a_worker_that_does_not_listen_is_ended():
+    with fac.Workers(sleeps, 1) as workers:
+        assert workers.receive(0) == "soundly"
+        began, ((process, _),) = time.monotonic(), workers._members
+    assert time.monotonic() - began < 10 and process.exitcode == -signal.SIGKILL
+
+
 def fails(connection):
     raise ZeroDivisionError
 
@@ -536,6 +612,9 @@ def test_returns_that_are_not_finite_are_never_elites(bad):
     with pytest.raises(fac.UserError, match="no action sequence has a finite return"):
         fac.mppi(lambda actions: np.full((2, 64), bad, np.float32), np.zeros_like(target), config,
                  streams(2))
+    with pytest.raises(fac.UserError, match="no action sequence has a finite return"):  # of one
+        fac.mppi(lambda actions: returns(actions) * np.array([[1], [bad]], np.float32),
+                 np.zeros_like(target), config, streams(2))
 
 
 def test_weights_out_of_range_are_an_error_not_an_action():
@@ -556,7 +635,7 @@ def test_without_a_seed_every_planner_is_another():
 def test_cores_are_those_this_process_may_use(monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 5, 7}, raising=False)
-    assert fac.cores() == 3 and fac.useful_workers(6) == 2
+    assert fac.cores() == 3 and fac.useful_workers(6) == 2 and fac.useful_workers(2) == 1
     monkeypatch.delattr(os, "sched_getaffinity")
     assert fac.cores() == 64
 

@@ -57,12 +57,24 @@ def test_the_buffer_drops_the_oldest_and_writes_a_replay(tmp_path, dtype):
     assert set(fac.Replay(tmp_path / "replay.npz").observation[:, 0]) == {3}  # the newest
 
 
+def test_segments_begin_anywhere_in_an_episode():
+    buffer = train_expert.ReplayBuffer(8, 3, fac.EPISODE_STEPS)
+    buffer.add(*episode(np.random.default_rng(0), 1))
+    *_, (_, start) = buffer.sample(np.random.default_rng(0), 5000, 3)
+    drawn, _ = np.histogram(start, 7, (0, 497))  # 498 starts, the last of which is 497
+    assert (start.min(), start.max()) == (0, 497)
+    assert 0.8 < drawn.min() / (5000 / 7) < drawn.max() / (5000 / 7) < 1.2
+
+
 def test_a_replay_is_spread_over_training(tmp_path):
     buffer = train_expert.ReplayBuffer(8, 3, 10 * fac.EPISODE_STEPS)
     for value in range(10):
         buffer.add(*episode(np.random.default_rng(0), value))
     buffer.write(tmp_path / "replay.npz", {"task": "walker-walk"}, episodes=3)
     assert fac.Replay(tmp_path / "replay.npz").observation[::501, 0].tolist() == [3, 6, 9]
+    buffer.write(tmp_path / "replay.npz", {"task": "reacher-hard"}, episodes=3)
+    found = fac.Replay(tmp_path / "replay.npz").observation
+    assert abs((found[:, 3:5] != found[:, :1]).all(1).mean() - 0.5) < 0.05  # other targets [D6]
 
 
 def test_half_of_a_reacher_replay_s_states_get_another_target():
@@ -254,6 +266,16 @@ def test_exploration_falls_and_no_episode_is_played_twice():
     assert len(set(seeds)) == len(seeds) == 2 + 3 * 4
 
 
+def test_evaluations_are_of_episodes_apart_and_of_each_model_s_horizon():
+    found = training("--seed", "4", "--evaluate-episodes", "2", "--distill-horizon", "1",
+                     "--std-steps", "0")
+    seeds = fac.episode_seeds(5, 2)  # not those that a run's own evaluation plays in the end
+    assert found.tests() == [(seed, name) for name in ("expert", "student") for seed in seeds]
+    planners = found.planners()
+    assert planners["expert"][1].horizon == 3 and planners["student"][1].horizon == 1
+    assert planners["student"][0] is found.student.model
+
+
 def test_every_update_has_states_and_perturbations_of_its_own(monkeypatch):
     found, noise, states, real = training(), [], [], fac.perturbed_batch
     found.buffer.add(*episode(np.random.default_rng(0), 1))
@@ -269,6 +291,62 @@ def test_every_update_has_states_and_perturbations_of_its_own(monkeypatch):
         found.learn()
     assert not np.array_equal(states[0][3][1], states[1][3][1])
     assert not np.array_equal(*noise)
+
+
+@pytest.mark.parametrize("horizon", [0, 2, 4])  # beside the expert's 3
+def test_expert_and_student_learn_over_their_own_horizons(horizon, monkeypatch):
+    found, seen = training("--distill-horizon", str(horizon), "--distill-grad-clip", "0.5"), []
+    found.buffer.add(*episode(np.random.default_rng(0), 1))
+    update, perturbed, student = found.learner.update, fac.perturbed_batch, found.student
+    monkeypatch.setattr(found.learner, "update", lambda obs, actions, reward, rng: (
+        seen.append((len(obs), len(actions), len(reward))), update(obs, actions, reward, rng))[1])
+    monkeypatch.setattr(fac, "perturbed_batch", lambda *args: (
+        seen.append(len(args[3])), perturbed(*args))[1])
+    step = student.optimizer.step
+    monkeypatch.setattr(student.optimizer, "step", lambda lr, clip: (
+        seen.append((lr, clip)), step(lr, clip))[1])
+    for t in range(2):
+        found.learn()
+        assert seen == [(4, 3, 3), horizon + 1, (fac.learning_rate(student.config, t), 0.5)]
+        seen.clear()
+
+
+class Still:
+    """Stands for `Actors`: notes what it is asked for; every episode is of ones."""
+
+    def __init__(self, learner):
+        self.learner, self.played = learner, []
+
+    def begin(self, episodes):
+        self.episodes = episodes
+
+    def play(self, decisions, planners):
+        self.played.append((decisions, self.learner.updates, set(planners)))
+
+    def wait(self):
+        return [episode(np.random.default_rng(0), 1) for _ in self.episodes]
+
+
+def test_a_round_s_episodes_go_on_with_newer_weights_in_every_part():
+    found = training("--refresh", "125")
+    assert found.student.config.steps == 30  # a hundredth of 3,000: the rate falls over these
+    found.decisions, found.allowed, found.curve = 2000, 8.0, [{}]
+    found.buffer.add(*episode(np.random.default_rng(0), 1))
+    actors = Still(found.learner)
+    found.round(actors, SimpleNamespace(update=lambda: None, set_postfix_str=lambda *_: None))
+    playing = {"explorer", "own"}  # and, with the weights that they began with, those tested
+    assert actors.played == [(125, 0, {*playing, "expert", "student"}), (125, 2, playing),
+                             (125, 4, playing), (125, 6, playing)]
+    assert (found.learner.updates, found.allowed, found.decisions) == (8, 18, 3000)
+    assert (len(found.buffer), len(found.student.own)) == (3, 2)
+
+
+def test_the_expert_learns_from_segments_with_other_targets(monkeypatch):
+    found, seen = training("--batch-size", "400"), []
+    found.buffer.add(*episode(np.random.default_rng(0), 1))
+    monkeypatch.setattr(found.learner, "update", lambda obs, *_: seen.append(obs) or [0.0] * 3)
+    found.learn()
+    assert 0.65 < (seen[0][0, 3:5] != 1).all(0).mean() < 0.85  # three quarters [D6]
 
 
 def test_evaluations_and_their_ratio_are_of_whom_they_name(monkeypatch, tmp_path):
