@@ -147,6 +147,8 @@ class ModelConfig(Settings):
     expert_latent_dim: int = field(0, "width of the expert's latent that the encoder reads; 0: it "
                                    "reads the observation", least=0)
     expert_enc_dim: int = field(256, "hidden width of the frozen expert encoder below it", least=1)
+    expert_mlp_dim: int = field(0, "hidden width of the expert's frozen policy and dynamics, which "
+                                "say where a plan begins; 0: there are none", least=0)
 
     def __post_init__(self):
         super().__post_init__()
@@ -165,7 +167,11 @@ class PlannerConfig(Settings):
     """MPPI. Raises UserError for values that can't plan."""
     samples: int = field(128, "S: action sequences drawn in an iteration [D5]", paper=512, least=1,
                          most=10 ** 6)
-    iterations: int = field(4, "refinements of the Gaussian in a decision [D5]", paper=6, least=1)
+    iterations: int = field(4, "refinements of the Gaussian in a decision [D5]; 0: its first mean "
+                               "is the action", paper=6, least=0)
+    prior: str = field("none", "a plan's first mean: the last plan's, moved on by one (none), or "
+                       "what the expert's policy would do [D9]", repr=False,
+                       choices=("none", "policy"))
     elites: int = field(0, "best ones, which refine it; 0: samples / 8 (Table 2: 64)", least=0)
     pi_trajs: int = field(24, "policy proposals, where there is a policy (Table 2)", least=0,
                           most=10 ** 6)
@@ -174,7 +180,8 @@ class PlannerConfig(Settings):
     discount: float = field(0.99, "gamma (Table 2); commands take the model file's own",
                             least=0, most=1)
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)", above=0)
-    max_std: float = field(2.0, "first and largest sampling deviation (Table 2)", above=0)
+    max_std: float = field(2.0, "first and largest sampling deviation (Table 2); distill "
+                           "chooses one of six for a search around the policy [D9]", above=0)
     inverse_temperature: float = field(0.5, "an elite weighs exp(this * return); `temperature` of "
                                        "Table 2, by which TD-MPC's code multiplies", above=0)
     momentum: float = field(0.1, "part of the old mean in the new (TD-MPC's code)", least=0, most=1)
@@ -211,7 +218,14 @@ class DistillConfig(Settings):
     steps: int = field(14_000, "gradient steps (section 5.1: 10^5) [D1]", paper=100_000, least=1)
     batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=2)
     noise_samples: int = field(5, "K: perturbations of each action [D1]", paper=10, least=2)
-    noise_std: float = field(0.5, "deviation of the perturbations (authors' code)", above=0)
+    noise_std: float = field(0.3, "deviation of the perturbations (authors' code: 0.5) [D9]",
+                             paper=0.5, plain=0.5, above=0)
+    targets: str = field("credit", "what Equation 4 compares: each agent's share with its part of "
+                         "the expert's prediction (credit), or sums of all shares (joint) [D9]",
+                         paper="joint", plain="joint", choices=("credit", "joint"))
+    policy_share: float = field(0.5, "share of states where what the expert's policy would do is "
+                                "perturbed, not what was done [D8]", paper=0.0, plain=0.0, least=0,
+                                most=1)
     clip_actions: bool = field(True, "clip perturbed actions to [-1, 1] [D7]", paper=False)
     reuse: int = field(4, "steps that learn from a state's perturbations [D1]", paper=1, least=1)
     horizon: int = field(3, "H of loss and planning (Table 2)", least=0, most=EPISODE_STEPS - 1)
@@ -230,17 +244,23 @@ class DistillConfig(Settings):
                              choices=("cosine", "constant"))
     warmup: int = field(200, "steps over which lr rises from zero [D1]", paper=0, least=0)
     grad_clip: float = field(10.0, "largest gradient norm (Table 2)", above=0)
-    own_episodes: int = field(16, "episodes that the student plays after each of the first three "
-                              "quarters of the steps, to learn from [D8]", paper=0, least=0)
-    own_share: float = field(0.25, "share of states from its own episodes [D8]", paper=0.0,
-                             least=0, most=1)
+    expert_episodes: int = field(96, "episodes that the expert's policy plays first, each with "
+                                 "noise of another deviation, up to 0.6 [D8]", paper=0, plain=0,
+                                 least=0)
+    played_share: float = field(0.5, "share of states from these [D8]; online: the student's own",
+                                paper=0.0, plain=0.0, least=0, most=1)
     held_out: float = field(0.1, "about this share of episodes is held out, for rank correlations, "
                             "others for each seed", least=1e-4, most=0.5)
 
     def __post_init__(self):
         super().__post_init__()
-        if self.own_episodes and not self.own_share:
-            self.refuse("own_share", "above 0 where there are own_episodes")
+        if self.expert_episodes and not self.played_share:
+            self.refuse("played_share", "above 0 where there are expert_episodes")
+
+
+# how a student plans, if its file says nothing else: around its expert's policy [D9]
+STUDENT_PLANNING = {"prior": "policy", "max_std": 0.25, "samples": 32, "iterations": 3,
+                    "output": "mean"}
 
 
 def seed_sequence(seed, **options):
@@ -282,8 +302,8 @@ def memory():
     return min(found)
 
 
-LARGE = ("samples", "pi_trajs", "horizon", "batch_size", "noise_samples", "own_episodes",
-         "buffer_size", "latent_dim", "enc_dim", "mlp_dim")  # settings that memory grows with
+LARGE = ("samples", "pi_trajs", "horizon", "batch_size", "noise_samples",
+         "expert_episodes", "buffer_size", "latent_dim", "enc_dim", "mlp_dim")  # memory's drivers
 
 
 def check_memory(numbers, *configs):
@@ -296,11 +316,12 @@ def check_memory(numbers, *configs):
          f"of memory, of {1e-9 * memory():.1f} GB here; lower it")
 
 
-def student_config(theirs, num_agents, encoder_input):
-    """A student's ModelConfig, from its expert's: latents of 50, hidden max(512 // N, 50)."""
+def student_config(theirs, num_agents, encoder_input, policy=False):
+    """A student's ModelConfig, from its expert's: latents of 50, hidden max(512 // N, 50).
+    policy: whether it keeps the expert's, for `--plan-prior policy`."""
     below = {} if encoder_input == "observation" else {
         "expert_latent_dim": theirs.num_agents * theirs.latent_dim,
-        "expert_enc_dim": theirs.enc_dim}
+        "expert_enc_dim": theirs.enc_dim, "expert_mlp_dim": theirs.mlp_dim if policy else 0}
     return ModelConfig(theirs.dim_obs, theirs.dim_action, num_agents,
                        50, 256, max(512 // max(1, num_agents), 50), **below)
 
@@ -488,10 +509,17 @@ class WorldModel:
 
     `params` maps official TD-MPC state-dict names to arrays with a leading agent axis, all of
     one dtype (float32; float64 only to check gradients). The encoder is centralized (N = 1); only
-    experts have TD-MPC's policy, `_pi` (a of high Q); only students an expert's frozen encoder."""
+    experts have TD-MPC's policy, `_pi` (a of high Q). A student keeps what of its `expert` runs
+    once a decision, frozen: the encoder, for its latent is what the student's reads [D3], and the
+    policy with the dynamics that it is rolled out in, where there is one."""
 
     def __init__(self, config, params):
-        self.config, self.params = config, params
+        self.config, self.params, self.expert = config, params, None
+        if config.expert_latent_dim:
+            theirs = ModelConfig(config.dim_obs, config.dim_action, 1, config.expert_latent_dim,
+                                 config.expert_enc_dim, config.expert_mlp_dim or 1)
+            self.expert = WorldModel(theirs, {k[len("_expert"):]: v for k, v in params.items()
+                                              if k.startswith("_expert")})
 
     @classmethod
     def create(cls, config, rng, policy=False, dtype=F32):
@@ -507,10 +535,7 @@ class WorldModel:
 
     def encode(self, obs):
         """s = f_E(g).  obs (O, B) -> latents (N, m, B)."""
-        x = obs[None]
-        if self.config.expert_latent_dim:  # a student reads the expert's latent [D3]
-            x = forward(ENCODER, self.params, "_expert_encoder", x)
-        return self.encode_features(x)
+        return self.encode_features(self.expert.encode(obs) if self.expert else obs[None])
 
     def encode_features(self, x, tape=None):
         """The trained encoder on (1, F, B); its output is cut into the agents' latents."""
@@ -539,18 +564,18 @@ class WorldModel:
         return "_pi.0.weight" in self.params
 
     def agents(self, i, j):
-        """The model of agents i..j-1 alone, without encoder and policy; the whole if it's all."""
+        """The model of agents i..j-1 alone, without what all share; the whole if it's all."""
         if j - i == self.config.num_agents:
             return self
-        config = dataclasses.replace(self.config, num_agents=j - i,
+        config = dataclasses.replace(self.config, num_agents=j - i, expert_latent_dim=0,
                                      dim_action=(j - i) * self.config.agent_actions)
         return WorldModel(config, {k: np.ascontiguousarray(v[i:j]) for k, v in self.params.items()
                                    if k.startswith(("_dynamics", "_reward", "_Q"))})
 
 
 def policy_rollout(model, z, noise):
-    """Roll a policy out in its own model from z (N, m, B): actions (L, N, d, B), each the policy's
-    plus its entry of `noise` (L of them), clipped to [-1, 1]."""
+    """Roll an expert's policy out in its model from z (1, m, B): actions (L, 1, A, B), each the
+    policy's plus its entry of `noise` (L of them), clipped to [-1, 1]."""
     actions = []
     for eps in noise:
         z = model.next(z, actions[-1]) if actions else z
@@ -571,6 +596,9 @@ def networks(config, policy=False):
     if latent:
         found.append(("_expert_encoder", ENCODER, 1,
                       (config.dim_obs, config.expert_enc_dim, latent)))
+    if latent and (width := config.expert_mlp_dim):
+        found += [("_expert_dynamics", MLP, 1, (latent + config.dim_action, width, width, latent)),
+                  ("_expert_pi", MLP, 1, (latent, width, width, config.dim_action))]
     return found
 
 
@@ -600,60 +628,58 @@ def planning_numbers(sizes, config):
             3 * (block + P) * sizes.num_agents * (sizes.latent_dim + 2 * sizes.mlp_dim))
 
 
-def unroll(model, z, actions, transitions, tapes=None):
+def unroll(model, z, actions, tapes=None):
     """Roll a model's latent out under given actions, every column on its own trajectory.
 
     z (N, m, B), actions (L, A, B, K): K perturbed copies of a trajectory. Returns the networks'
-    input x (N, m + d, L * B * K), columns in the order (L, B, K), with s_{h+1} = f_T(s_h, a_h), and
-    the latents after the last transition (N, m, B * K), if any: for Equation 4 L - 1 transitions
-    suffice, for Equation 1 it takes L. tapes (`predict_backward`): one a head, one for each h."""
+    input x (N, m + d, L * B * K), columns in the order (L, B, K), with s_{h+1} = f_T(s_h, a_h).
+    tapes, for `unroll_backward`: "_dynamics h" for each h."""
     L, _, B, K = actions.shape
     n, m, d = model.config.num_agents, model.config.latent_dim, model.config.agent_actions
     columns = B * K
     x = np.empty((n, m + d, L * columns), z.dtype)
     x[:, m:] = actions.reshape(L, n, d, columns).transpose(1, 2, 0, 3).reshape(n, d, -1)
     x[:, :m, :columns] = np.repeat(z, K, axis=2)
-    end = None
-    for h in range(transitions):
-        end = forward(MLP, model.params, "_dynamics", x[:, :, h * columns:(h + 1) * columns],
-                      None if tapes is None else tapes[f"_dynamics {h}"])
-        if h < L - 1:
-            x[:, :m, (h + 1) * columns:(h + 2) * columns] = end
-    return x, end
-
-
-def predict(model, z, actions, tapes=None):
-    """Global rewards and both Q at every step of a rollout: three (L, B, K), as in `unroll`."""
-    x, _ = unroll(model, z, actions, len(actions) - 1, tapes)
-    return run_heads(model, x, actions, tapes)
+    for h in range(L - 1):
+        now, after = (slice(i * columns, (i + 1) * columns) for i in (h, h + 1))
+        x[:, :m, after] = forward(MLP, model.params, "_dynamics", x[:, :, now],
+                                  None if tapes is None else tapes[f"_dynamics {h}"])
+    return x
 
 
 def run_heads(model, x, actions, tapes=None):
-    """Global reward and both Q of `unroll`'s x: the sums over agents, three (L, B, K)."""
+    """Every agent's share of reward and both Q at `unroll`'s x: three (N, L, B, K)."""
     L, _, B, K = actions.shape
-    return [forward(kinds, model.params, name, x, None if tapes is None else tapes[name]).sum(0)
-            .reshape(L, B, K) for name, kinds in HEADS]
+    return [forward(kinds, model.params, name, x, None if tapes is None else tapes[name])
+            .reshape(-1, L, B, K) for name, kinds in HEADS]
 
 
-def predict_backward(model, tapes, d_outputs, grads, d_latents=None):
-    """Walk `unroll` and `run_heads` back; adds to `grads`, returns dz (N, m, B).
+def predict(model, z, actions):
+    """Global rewards and both Q at every step of a rollout: sums over agents, three (L, B, K)."""
+    return [shares.sum(0) for shares in run_heads(model, unroll(model, z, actions), actions)]
 
-    d_outputs: gradients of the outputs; d_latents (L, N, m, B * K), Equation 1's: of s_1 .. s_L."""
-    n, m = model.config.num_agents, model.config.latent_dim
-    (L, B, K), dx = d_outputs[0].shape, 0
-    columns = B * K
-    for (name, kinds), d_out in zip(HEADS, d_outputs):
-        # the global output is the sum over agents: each share has the same gradient
-        d_share = np.repeat(d_out.reshape(1, 1, -1), n, 0)
-        dx = dx + backward(kinds, model.params, name, tapes[name], d_share, grads)
-    for h in reversed(range(L - (d_latents is None))):
-        d_next = 0 if d_latents is None else d_latents[h]
-        if h < L - 1:
-            d_next = d_next + dx[:, :m, (h + 1) * columns:(h + 2) * columns]
-        dx[:, :, h * columns:(h + 1) * columns] += backward(
-            MLP, model.params, "_dynamics", tapes[f"_dynamics {h}"],
-            np.ascontiguousarray(d_next), grads)
-    return dx[:, :m, :columns].reshape(n, m, B, K).sum(3)
+
+def heads_backward(model, tapes, d_shares, grads):
+    """Walk `run_heads` back: adds to `grads`, returns dx (N, m + d, L * B * K).
+
+    d_shares: gradients of the shares (N, L, B, K), or of a sum of agents' (fewer rows): each share
+    in a sum has the sum's gradient."""
+    n, dx = model.config.num_agents, 0
+    for (name, kinds), d in zip(HEADS, d_shares):
+        d = np.repeat(d, n // len(d), 0).reshape(n, 1, -1)
+        dx = dx + backward(kinds, model.params, name, tapes[name], d, grads)
+    return dx
+
+
+def unroll_backward(model, tapes, actions, dx, grads):
+    """Walk `unroll` back from its x's gradient dx, overwritten: adds to `grads`, returns dz
+    (N, m, B)."""
+    (L, _, B, K), n, m = actions.shape, model.config.num_agents, model.config.latent_dim
+    for h in reversed(range(L - 1)):
+        now, after = (slice(i * B * K, (i + 1) * B * K) for i in (h, h + 1))
+        dx[:, :, now] += backward(MLP, model.params, "_dynamics", tapes[f"_dynamics {h}"],
+                                  np.ascontiguousarray(dx[:, :m, after]), grads)
+    return dx[:, :m, :B * K].reshape(n, m, B, K).sum(3)
 
 
 # ==== 4. Model distillation (section 4.4, Algorithm 1, Equation 4) ====================
@@ -686,42 +712,48 @@ def distill_loss(student, features, actions, targets, config, grads=None, diverg
         mean over B of sum_h lambda^h [c_R D(R_h) + c_Q (D(Q1_h) + D(Q2_h))]
 
     features (1, F, B): what the student's encoder reads in the first states; actions
-    (L, A, B, K): perturbed; targets: the expert's `predict` for them. Returns the loss and
-    the mean divergences of reward and value over steps and states. divergence: D, as `soft_kl`."""
+    (L, A, B, K): perturbed; targets: the expert's `predict` for them, three (L, B, K), or each
+    agent's part of these (`credit`), (N, L, B, K): D is summed over agents then. divergence: D, as
+    `soft_kl`. Returns the loss and the mean divergences of reward and value over steps and states.
+    """
     tapes, encoder_tape = defaultdict(list), []
     z = student.encode_features(features, encoder_tape)
-    losses, d_outputs = divergences(predict(student, z, actions, tapes), targets, config,
-                                    divergence)
+    x = unroll(student, z, actions, tapes)
+    losses, d_shares = divergences(run_heads(student, x, actions, tapes), targets, config,
+                                   divergence)
     if grads is not None:
-        dz = predict_backward(student, tapes, d_outputs, grads)
+        dx = heads_backward(student, tapes, d_shares, grads)
+        dz = unroll_backward(student, tapes, actions, dx, grads)
         backward(ENCODER, student.params, "_encoder", encoder_tape,
                  dz.reshape(1, -1, z.shape[-1]), grads)
     return losses
 
 
-def divergences(outputs, targets, config, divergence=soft_kl):
-    """The sum in `distill_loss` of a student's and its expert's `predict`: what that returns, and
-    the gradients by the student's outputs, three (L, B, K)."""
-    L, B, _ = outputs[0].shape
-    lam = (config.lam ** np.arange(L) / B).astype(outputs[0].dtype)[:, None]
-    loss, means, d_outputs = 0.0, [], []
+def divergences(heads, targets, config, divergence=soft_kl):
+    """The sum in `distill_loss` of a student's `run_heads`: what that returns, and its gradients by
+    the shares, three (N, L, B, K), or where targets are joint (1, L, B, K)."""
+    _, L, B, K = heads[0].shape
+    lam = (config.lam ** np.arange(L) / B).astype(heads[0].dtype)[:, None]
+    loss, means, d_shares = 0.0, [], []
     coefs = (config.reward_coef, config.value_coef, config.value_coef)
-    for coef, output, target in zip(coefs, outputs, targets):
+    for coef, shares, target in zip(coefs, heads, targets):
+        target = target.reshape(-1, L, B, K)  # a row for all agents, or one for each
+        output = shares.reshape(len(target), -1, L, B, K).sum(1)
         kl, d_output = divergence(output, target, config.temperature_student,
                                   config.temperature_expert, config.kl)
         loss += coef * float((lam * kl).sum())
-        means.append(float(kl.mean()))
-        d_outputs.append(coef * lam[..., None] * d_output)
-    return (loss, means[0], (means[1] + means[2]) / 2), d_outputs
+        means.append(float(kl.sum(0).mean()))
+        d_shares.append(coef * lam[..., None] * d_output)
+    return (loss, means[0], (means[1] + means[2]) / 2), d_shares
 
 
 def new_student(expert, config, seed):
     """(Adam, student): a fresh student of an expert, and Adam on those of its weights that train.
 
-    Where the student reads the expert's latent, it shares the expert's own encoder arrays [D3]."""
+    What a student keeps of its expert are the expert's own arrays."""
     student = WorldModel.create(config, stream(seed, "student"))
-    frozen = {"_expert" + k: v for k, v in expert.params.items()
-              if k.startswith("_encoder.") and config.expert_latent_dim}
+    frozen = {k: expert.params[k[len("_expert"):]] for k in student.params
+              if k.startswith("_expert")}
     optimizer = Adam({k: v for k, v in student.params.items() if not k.startswith("_expert")})
     return optimizer, WorldModel(config, {**optimizer.params, **frozen})
 
@@ -735,26 +767,74 @@ def learning_rate(config, t):
 
 
 def perturbed_batch(expert, student, obs, actions, config, rng):
-    """Features (1, F, B), perturbed actions (L, A, B, K) and the expert's predictions for them.
+    """Features (1, F, B), perturbed actions (L, A, B, K) and the expert's predictions for them, or
+    with `credit` what each agent did to these: then copy 0 is not perturbed.
 
     obs (O, B); a_h (L, A, B, 1), or one a copy (L, A, B, K): a_h + eps_h may be clipped [D7]."""
     noise = rng.standard_normal((*actions.shape[:3], config.noise_samples), F32)
+    tapes = defaultdict(list) if config.targets == "credit" else None
+    if tapes is not None:
+        noise[..., 0] = 0
     limit = 1 if config.clip_actions else np.inf
     perturbed = np.clip(actions + F32(config.noise_std) * noise, -limit, limit)
     z = expert.encode(obs)
     features = z.reshape(1, -1, z.shape[-1]) if student.config.expert_latent_dim else obs[None]
-    return features, perturbed, predict(expert, z, perturbed)
+    x = unroll(expert, z, perturbed, tapes)
+    targets = [shares.sum(0) for shares in run_heads(expert, x, perturbed, tapes)]
+    if tapes is not None:
+        targets = credit(expert, tapes, perturbed, targets, student.config.num_agents)
+    return features, perturbed, targets
 
 
-def own_actions(expert, obs, played, copies, rng):
-    """Actions (L, A, B, K) to perturb in the student's own states obs (O, B) [D8]: a coin for each
-    copy picks the expert policy's, rolled out from obs, or what the student `played` (L, A, B)."""
-    pi = policy_rollout(expert, expert.encode(obs), [F32(0)] * len(played))[:, 0]
-    return np.where(rng.random((len(obs.T), copies)) < 0.5, pi[..., None], played[..., None])
+# ---- Added to the paper: what is perturbed, and what each joint did to a prediction.
+
+def around_policy(expert, obs, actions, share, rng):
+    """Actions (L, A, B) to perturb in states obs (O, B): for a share of these what the expert's
+    policy would do, rolled out in its model, for the others the given ones [D8]."""
+    chosen = rng.random(obs.shape[1]) < share
+    if chosen.any():
+        z, actions = expert.encode(obs[:, chosen]), actions.copy()
+        actions[:, :, chosen] = policy_rollout(expert, z, [F32(0)] * len(actions))[:, 0]
+    return actions
 
 
-POOL, PART = 4096, 256  # states that the expert predicts at once, and a thread's part of them
-OWN_BUDGET = {"samples": 64, "iterations": 3, "elites": 0}  # MPPI's in own episodes [D8]
+def credit(expert, tapes, actions, predicted, agents):
+    """Each agent's part of what perturbing actions does to the expert's predictions.
+
+    Copy 0 is unperturbed. Along the line from its actions to copy k's a prediction y changes by the
+    integral of its gradient g, which is a sum over agents. With the line's two ends for the line:
+
+        part^i(y_h)_k = sum_{j <= h} (a_j^i,k - a_j^i,0) . (g_j^i,k + g_j^i,0) / 2,  g_j = dy_h/da_j
+
+    What these leave of y_h,k - y_h,0 is shared evenly. So the parts add up to the change, and the
+    one part of N = 1 teaches what the paper's joint divergence does: a softmax knows no constants.
+
+    expert: of one agent; tapes: of `unroll` and `run_heads` for its actions (L, A, B, K), used up;
+    predicted: three (L, B, K). Returns the reward's parts (N, L, B, K) and, for each Q, those of
+    both Q's mean, by which plans are ranked."""
+    (L, A, B, K), m, params = actions.shape, expert.config.latent_dim, expert.params
+    half = np.full((1, 1, L * B * K), 0.5, actions.dtype)
+    d_q = sum(backward(QNET, params, name, tapes[name], half, None) for name in ("_Q1", "_Q2"))
+    d_reward = backward(MLP, params, "_reward", tapes["_reward"], 2 * half, None)
+    dx, later = np.stack([d_reward[0], d_q[0]], 1).reshape(m + A, 2, L, B * K), None
+    way = actions - actions[..., :1]
+    parts = np.zeros((A, 2, L, B, K), actions.dtype)
+    for j in reversed(range(L)):
+        d = dx[:, :, j:j + 1]  # of the outputs at h = j by (s_j, a_j); those at h > j come by s_j+1
+        if j < L - 1:
+            tape = [np.tile(y, 2 * (L - 1 - j)) for y in tapes[f"_dynamics {j}"]]
+            later = backward(MLP, params, "_dynamics", tape, later.reshape(1, m, -1), None)
+            d = np.concatenate([d, later.reshape(m + A, 2, L - 1 - j, -1)], 2)
+        later, g = d[:m], d[m:].reshape(A, 2, L - j, B, K)
+        parts[:, :, j:] += way[j][:, None, None] * (g + g[..., :1]) / 2
+    parts = parts.reshape(agents, -1, 2, L, B, K).sum(1)
+    y = np.stack([predicted[0], (predicted[1] + predicted[2]) / 2])
+    parts += (y - y[..., :1] - parts.sum(0)) / agents
+    return [parts[:, 0], parts[:, 1], parts[:, 1]]
+
+
+POOL, PART = 4096, 64  # states that the expert predicts at once, and a thread's part of them
+EXPERT_NOISE = 0.6  # largest deviation of the noise in episodes that its policy plays [D8]
 
 
 class Distiller:
@@ -776,17 +856,21 @@ class Distiller:
              f"expert expects ({theirs.dim_obs}, {theirs.dim_action}); pass its own task's replay")
         need(not theirs.expert_latent_dim, "an expert has an encoder of its own; this is a student")
         self.expert, self.replay, self.config, self.seed = expert, replay, config, seed
-        need(expert.has_policy or not config.own_episodes, "the expert has no policy, which says "
-             "what to do in the student's own states; pass --own-episodes 0")
-        self.own = np.zeros((0, 0, replay.dim_obs + replay.dim_action), np.float16)
+        need(expert.has_policy or not (config.policy_share or config.expert_episodes),
+             "the expert has no policy to learn from; pass --policy-share 0 --expert-episodes 0 "
+             "--plan-prior none")
+        need(theirs.num_agents == 1 or config.targets == "joint", f"the expert has "
+             f"{theirs.num_agents} agents, credit is for one; pass --targets joint")
+        self.played = np.zeros((0, 0, replay.dim_obs + replay.dim_action), np.float16)
         agents = theirs.dim_action if num_agents is None else num_agents
         needed = config.steps * config.batch_size // config.reuse
         self.pool_size = max(config.batch_size, min(POOL, needed))
-        sizes = dataclasses.replace(student_config(theirs, agents, config.encoder_input), **sizes)
+        sizes = dataclasses.replace(student_config(theirs, agents, config.encoder_input,
+                                                   expert.has_policy), **sizes)
         copies = config.noise_samples * (config.horizon + 1)  # columns of a state
         check_memory(learning_numbers(sizes, config.batch_size * copies) + copies * (
-            2 * self.pool_size * (theirs.dim_action + 3) + 8 * PART * theirs.mlp_dim) +
-            config.own_episodes * 3 * EPISODE_STEPS * (theirs.dim_obs + theirs.dim_action),
+            2 * self.pool_size * (theirs.dim_action + 3) + 24 * PART * theirs.mlp_dim) +
+            config.expert_episodes * EPISODE_STEPS * (theirs.dim_obs + theirs.dim_action),
             config, sizes)
         with one_thread():
             self.optimizer, self.student = new_student(expert, sizes, seed)
@@ -798,17 +882,16 @@ class Distiller:
     def draw(self, number, part, size):
         """Lines 4 and 6 (expert), `size` states, part `part` of a pool; as `perturb` returns."""
         rng, L = stream(self.seed, f"pool {number}", part), self.config.horizon + 1
-        K, dim_obs = self.config.noise_samples, self.replay.dim_obs
         obs, actions = self.replay.sequences(rng.choice(self.train_starts, size), L)
-        actions = np.repeat(actions[..., None], K, -1)
-        is_own = rng.random(size) < (self.config.own_share if len(self.own) else 0)  # [D8]
-        if count := is_own.sum():
-            episode = rng.integers(len(self.own), size=count)
-            t = rng.integers(self.own.shape[1] - L + 1, size=count) + np.arange(L)[:, None]
-            seen, played = np.split(self.own[episode, t].swapaxes(1, 2).astype(F32), [dim_obs], 1)
-            obs[:, is_own] = seen[0]  # of (L, O, count)
-            actions[:, :, is_own] = own_actions(self.expert, seen[0], played, K, rng)
-        return self.perturb(self.expert, self.student, obs, actions, self.config, rng)
+        is_played = rng.random(size) < (self.config.played_share if len(self.played) else 0)
+        if count := is_played.sum():
+            episode = rng.integers(len(self.played), size=count)
+            t = rng.integers(self.played.shape[1] - L + 1, size=count) + np.arange(L)[:, None]
+            seen, done = np.split(self.played[episode, t].swapaxes(1, 2).astype(F32),
+                                  [self.replay.dim_obs], 1)
+            obs[:, is_played], actions[:, :, is_played] = seen[0], done  # seen (L, O, count)
+        actions = around_policy(self.expert, obs, actions, self.config.policy_share, rng)
+        return self.perturb(self.expert, self.student, obs, actions[..., None], self.config, rng)
 
     def batch(self, t):
         """Step t's part of its pool, which is gone through `reuse` times, in another order each:
@@ -820,12 +903,12 @@ class Distiller:
             features, actions, targets = zip(*self._threads.map(
                 self.draw, itertools.repeat(number), itertools.count(), lengths))
             self._pool = (np.concatenate(features, 2), np.concatenate(actions, 2),
-                          [np.concatenate(target, 1) for target in zip(*targets)])
+                          [np.concatenate(target, -2) for target in zip(*targets)])
             rng, self._number = stream(self.seed, "order", number), number
             self._order = np.concatenate([rng.permutation(self.pool_size) for _ in range(reuse)])
         chosen = self._order[step * size:(step + 1) * size]
         features, actions, targets = self._pool
-        return features[..., chosen], actions[:, :, chosen], [x[:, chosen] for x in targets]
+        return features[..., chosen], actions[:, :, chosen], [x[..., chosen, :] for x in targets]
 
     def step(self):
         """Lines 4 to 6 once. Returns loss, mean reward divergence, mean value divergence."""
@@ -834,7 +917,7 @@ class Distiller:
 
         def learn(part, grads):
             return self.loss(self.student, features[..., part], actions[:, :, part],
-                             [x[:, part] for x in targets], self.config, grads)
+                             [x[..., part, :] for x in targets], self.config, grads)
 
         with one_thread():
             features, actions, targets = self.batch(self.t)
@@ -847,16 +930,12 @@ class Distiller:
             self.optimizer.step(learning_rate(self.config, self.t), self.config.grad_clip)
         return tuple(total.tolist())
 
-    def run(self, play_own=None):
+    def run(self):
         """Algorithm 1 from here to its end; yields each step's losses. UserError if they diverge.
-
-        play_own(first, count): lets the student play episodes first, ..., first + count - 1 of its
-        own and returns what `add` takes; not needed without own episodes [D8]."""
-        need(play_own or not self.config.own_episodes, "pass `play_own`, or set own_episodes=0")
+        `add` what the expert's policy plays first."""
+        need(len(self.played) or not self.config.expert_episodes, "`add` the `expert_episodes`, or "
+             "set expert_episodes=0")
         while self.t < self.config.steps:
-            played, quarter = len(self.own), 4 * self.t // self.config.steps
-            if quarter * self.config.own_episodes > played:
-                self.add(*play_own(played, quarter * self.config.own_episodes - played))
             losses = self.step()
             check_finite({"loss is": losses}, self.t, self.config.lr)
             yield losses
@@ -867,22 +946,22 @@ class Distiller:
         return self.optimizer.t
 
     def add(self, observation, action):
-        """Let episodes (E, T, O), (E, T, A) join `own` (all, T, O + A) [D8]; any T above H."""
+        """Let episodes (E, T, O), (E, T, A) join `played` (all, T, O + A) [D8]; any T above H."""
         episodes = np.concatenate([observation, action], 2)
-        need((np.abs(episodes) <= 65504).all(), "own episodes: not finite, or above 65504")
+        need((np.abs(episodes) <= 65504).all(), "played episodes: not finite, or above 65504")
         episodes = episodes.astype(np.float16)
-        self.own = np.concatenate([self.own, episodes]) if len(self.own) else episodes
+        self.played = np.concatenate([self.played, episodes]) if len(self.played) else episodes
         self._number = None  # its pool is drawn again, with them
 
     def state(self):
         """Everything that a resumed run needs."""
-        return {**self.optimizer.state(), "own": self.own}
+        return {**self.optimizer.state(), "played": self.played}
 
     def load(self, state):
         """Go on from a `state`."""
         self.optimizer.load(state)
-        episodes, steps, _ = state["own"].shape
-        self.own, self._number = state["own"].reshape(episodes, steps, self.own.shape[2]), None
+        shape = *state["played"].shape[:2], self.played.shape[2]  # or it is another robot's
+        self.played, self._number = state["played"].reshape(shape), None
 
     def close(self):
         """Stop the threads."""
@@ -909,7 +988,8 @@ def rank_by_state(distiller, rows, discount, rng):
     Spearman's correlation over 32 action sequences in the states of the replay's `rows` (B,); 1 is
     the same order (section 4.4). Returns that of the global Q at each step h of the rollout, and
     that of the global return G (Equation 2), by which planning ranks, for each H: two (L, B)."""
-    student, config = distiller.student, dataclasses.replace(distiller.config, noise_samples=32)
+    student, config = distiller.student, dataclasses.replace(
+        distiller.config, noise_samples=32, targets="joint")
     obs, actions = distiller.replay.sequences(rows, config.horizon + 1)
     with one_thread():
         x, actions, expert = distiller.perturb(distiller.expert, student, obs, actions[..., None],
@@ -977,7 +1057,7 @@ def mppi(returns, mean, config, rngs, proposals=None):
     Elites are chosen agent by agent (Equation 3): a plan's G is sum_i G_i(a_i): the best of each is
     the best of all (Proposition 1). N = 1 is centralized MPPI. Returns the new mean (N, L, d), the
     last elites (N, L, d, E), scores (N, E) of sum 1 each. UserError: an agent has no finite G."""
-    mean, std = mean[..., None], F32(config.max_std)
+    mean, std, elites, scores = mean[..., None], F32(config.max_std), None, None
     if proposals is not None:
         G_proposals = returns(proposals)
     for _ in range(config.iterations):
@@ -1037,19 +1117,25 @@ class AgentPlanner:
         if len(seeds):
             self.rngs = [np.random.Generator(np.random.SFC64(s)) for s in seeds]
 
-    def plan(self, z):
-        """z (N, m, 1) -> first actions (N, d). The mean, moved on by one, starts the next plan."""
-        config = self.config
-        returns = (self.fast.start(z, config) if self.fast else
-                   functools.partial(h_step_return, self.model, z, config=config))
-        mean, elites, scores = mppi(returns, self.mean, config, self.rngs, self._proposals(z))
+    def plan(self, z, prior=None):
+        """z (N, m, 1) -> first actions (N, d). The mean, moved on by one, starts the next plan,
+        unless this has a `prior` (N, L, d)."""
+        mean, elites, scores = self.search(z, self.mean if prior is None else prior)
         self.mean = np.concatenate([mean[:, 1:], np.zeros_like(mean[:, :1])], 1)
-        return mean[:, 0] if config.output == "mean" else draw_elite(elites, scores, self.rngs)
+        if self.config.output == "mean" or not self.config.iterations:
+            return mean[:, 0]
+        return draw_elite(elites, scores, self.rngs)
+
+    def search(self, z, mean):
+        """MPPI from the latent z (N, m, 1) and a first mean (N, L, d), as `mppi` returns."""
+        returns = (self.fast.start(z, self.config) if self.fast else
+                   functools.partial(h_step_return, self.model, z, config=self.config))
+        return mppi(returns, mean, self.config, self.rngs, self._proposals(z))
 
     def _proposals(self, z):
         """Noisy policy rollouts (1, L, A, P), where there is a policy (TD-MPC's code)."""
         P, L = self.config.pi_trajs, self.config.horizon + 1
-        if not (self.model.has_policy and P):
+        if not (self.model.has_policy and P and self.config.iterations):
             return None
         noise = policy_noise((L, 1, self.model.config.dim_action, P), self.rngs[0])
         return policy_rollout(self.model, np.repeat(z, P, 2), noise).swapaxes(0, 1)
@@ -1068,7 +1154,10 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
     weights are copied: make a new planner when they have changed."""
 
     def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
-        self.model, sequence = model, seed_sequence(seed)
+        self.model, self.config, sequence = model, config, seed_sequence(seed)
+        self._teacher = model.expert or model  # whose policy a plan may begin from
+        need(config.prior == "none" or self._teacher.has_policy, "planner: prior: the model has no "
+             "policy to begin from; pass none")
         check_memory(planning_numbers(model.config, config), config, model.config)
         self._parts = split_agents(model.config.num_agents, workers)
         own, *others = ((model.agents(part.start, part.stop), config) for part in self._parts)
@@ -1097,14 +1186,61 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
         need(obs.shape == shape, f"observation: expected shape {shape}, found {obs.shape}")
         need(np.isfinite(obs).all(), "observation: holds values that are not finite")
         with one_thread():
-            z = self.model.encode(obs[:, None])
+            z, prior = self.model.encode(obs[:, None]), self._prior(obs)
+            tasks = [(z[part], prior if prior is None else prior[part]) for part in self._parts]
             try:
-                self._workers.send_all(z[part] for part in self._parts[1:])
-                plans = [self.own.plan(z[self._parts[0]]), *self._workers.receive_all()]
+                self._workers.send_all(tasks[1:])
+                plans = [self.own.plan(*tasks[0]), *self._workers.receive_all()]
             except BaseException:  # answers left unread would be the next decision's
                 self.close()
                 raise
         return np.concatenate(plans).reshape(-1)
+
+    def _prior(self, obs):
+        """The expert's policy from obs (O,) on, rolled out in its model: (N, L, d), or None."""
+        if self.config.prior == "none":
+            return None
+        actions = policy_rollout(self._teacher, self._teacher.encode(obs[:, None]),
+                                 [F32(0)] * (self.config.horizon + 1))
+        sizes = self.model.config
+        return actions.reshape(-1, sizes.num_agents, sizes.agent_actions).swapaxes(0, 1)
+
+
+WIDTHS = 0.05, 0.1, 0.15, 0.25, 0.4, 0.6  # deviations that a search around the policy may have
+
+
+def plan_gains(expert, model, config, obs, seed=0):
+    """What plans of the expert or a student, `model`, are worth above what the expert's policy
+    would do, in states obs (O, S): by the expert's own G, and by the model's (what they promise),
+    two (S,)."""
+    with one_thread():
+        z, own, planner = expert.encode(obs), model.encode(obs), AgentPlanner(model, config)
+        policy = policy_rollout(expert, z, [F32(0)] * (config.horizon + 1))[:, 0]
+        L, N, states = len(policy), len(own), obs.shape[1]
+        first = policy * F32(config.prior == "policy")
+        first = first.reshape(L, N, -1, states).transpose(3, 1, 0, 2)
+        plans = []
+        for i, seeds in enumerate(seed_sequence(seed).spawn(states)):
+            planner.reset(seeds.spawn(N))
+            plans.append(planner.search(own[:, :, i:i + 1], first[i])[0])
+        both = np.stack([np.stack(plans, -1).swapaxes(0, 1).reshape(policy.shape), policy], -1)
+        G = [horizon_returns(*predict(*of, both), config.discount)[-1]
+             for of in ((expert, z), (model, own))]
+    return [g[:, 0] - g[:, 1] for g in G]
+
+
+def search_width(distiller, config, states=128):
+    """The deviation of WIDTHS with which a student's search gains most by the expert's G, less a
+    standard error, in held-out states; and of each [width, mean gain, its standard error, mean
+    promise] [D9]."""
+    starts = stream(distiller.seed, "search width").choice(distiller.held_out_starts, states)
+    (obs, _), rows = distiller.replay.sequences(starts, 1), []
+    for width in WIDTHS:
+        gain, promise = plan_gains(distiller.expert, distiller.student, dataclasses.replace(
+            config, max_std=width, min_std=min(width, config.min_std)), obs, distiller.seed)
+        rows.append([width, *map(float, (gain.mean(), gain.std(ddof=1) / np.sqrt(states),
+                                         promise.mean()))])
+    return max(rows, key=lambda row: row[1] - row[2])[0], rows
 
 
 # ---- The same, fast: a first reading skips this. `Returns` computes h_step_return.
@@ -1242,7 +1378,7 @@ def _planning_worker(connection):
         if isinstance(message, list):
             planner.reset(message)
         else:
-            connection.send(planner.plan(message))
+            connection.send(planner.plan(*message))
 
 
 class WorkerError(UserError):
@@ -1525,13 +1661,14 @@ def made_for(header, where):
     """What a model's file was trained, or distilled, for, as settings of a PlannerConfig: discount,
     horizon and action repeat, those that it names. The one place that reads them."""
     found, there = {}, f"{where}: header"
-    for group, name in (("training", "discount"), ("training", "horizon"), ("distill", "horizon")):
+    for group, names in (("training", ("discount", "horizon")), ("distill", ("horizon",)),
+                         ("planner", STUDENT_PLANNING)):
         settings = header.get(group) or {}
         need(isinstance(settings, dict), f"{there}: {group}: expected settings, found "
              f"{settings!r}")
-        if name in settings:
-            from_dict(PlannerConfig, {name: settings[name]}, f"{there}: {group}")
-            found[name] = settings[name]
+        settings = {name: settings[name] for name in names if name in settings}
+        from_dict(PlannerConfig, settings, f"{there}: {group}")
+        found.update(settings)
     if "action_repeat" in header:
         found["action_repeat"] = header["action_repeat"]
     from_dict(PlannerConfig, found, there)
@@ -1609,18 +1746,23 @@ def data_file(task, name):
 
 # ==== 8. Commands =====================================================================
 
-def decisions(model, task, config, seeds, environment=None):
+def decisions(model, task, config, seeds, environment=None, noise=0.0):
     """Plan through the episode of each seed; yields every decision's observation (O,), action
-    (A,), reward and seconds of planning. environment: instead of the task's, equally long."""
+    (A,), reward and seconds of planning. environment: instead of the task's, equally long. noise:
+    each episode draws the deviation of what is added to its actions, evenly from 0 to this."""
     environment = Environment(task, config.action_repeat) if environment is None else environment
     planner = Planner(model, config)
     for seed in seeds:
         planner.reset(seed)
-        obs = environment.reset(seed)
+        obs, rng = environment.reset(seed), stream(seed, "exploration")
+        deviation = F32(rng.uniform(0, noise))
         for _ in range(config.episode_steps):
             begin = time.perf_counter()
             action = planner.act(obs)
             seconds = time.perf_counter() - begin
+            if noise:
+                action = action + deviation * rng.standard_normal(action.shape, F32)
+                action = np.clip(action, -1, 1)
             before, (obs, reward) = obs, environment.step(action)
             yield before, action, reward, seconds
 
@@ -1633,12 +1775,12 @@ def _playing_worker(connection):
         connection.send(part)
 
 
-def play(model, task, config, seeds, workers=None, label="playing", environment=None):
+def play(model, task, config, seeds, workers=None, label="playing", environment=None, noise=0.0):
     """Plan through the episodes of `seeds`: observations (E, T, O), actions (E, T, A), rewards
     (E, T) and seconds of planning (E, T), with T = config.episode_steps.
 
     workers: processes that share the episodes [one for each core]; 0, or with an `environment`: all
-    in this one. An episode depends on its seed, not on their number."""
+    in this one. An episode depends on its seed, not on their number. noise: as `decisions`'s."""
     E, T, sizes = len(seeds), config.episode_steps, model.config
     at_once = math.gcd(T, 25)  # decisions of a worker's message: of one episode
     found = [np.zeros((E, T, *shape), F32) for shape in ((sizes.dim_obs,), (sizes.dim_action,))]
@@ -1646,10 +1788,11 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
     workers = 0 if environment is not None else min(
         E, cores() if workers is None else count(workers, "workers"))
     parts = [range(w, E, workers or 1) for w in range(workers or 1)]
-    here, done = decisions(model, task, config, seeds, environment), [0] * len(parts)
+    here, done = decisions(model, task, config, seeds, environment, noise), [0] * len(parts)
     with progress(label, E * T, "decision") as bar, \
             Workers(_playing_worker, workers, "evaluation worker") as pool:
-        pool.send_all((at_once, model, task, config, [seeds[i] for i in part]) for part in parts)
+        pool.send_all((at_once, model, task, config, [seeds[i] for i in part], None, noise)
+                      for part in parts)
         while sum(done) < E * T:  # a disabled bar doesn't count
             for w, part in enumerate(parts):
                 if done[w] < len(part) * T:
@@ -1703,20 +1846,24 @@ def interleaved_seconds(calls, rounds, label):
     return seconds[1:]
 
 
+def expert_episodes(distiller, task, config, workers=None, environment=None):
+    """What `Distiller.add` takes: episodes in which the expert's policy acts, each with noise of
+    another deviation [D8]. config: a PlannerConfig; workers, environment: as `play`'s."""
+    seeds = training_seeds(distiller.seed, "expert episode", 0, distiller.config.expert_episodes)
+    policy = dataclasses.replace(config, prior="policy", iterations=0)
+    return play(distiller.expert, task, policy, seeds, workers, "the expert plays", environment,
+                EXPERT_NOISE)[:2]
+
+
 CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correlation_h0",
          "rank_correlation_last", "rank_correlation_return")
 
 
-def train_student(distiller, out, settings, playing, workers):
+def train_student(distiller, out, settings, planning, workers):
     """Algorithm 1 to its end, with a learning curve and checkpoints in the folder `out`.
 
     A run that was cut off goes on from its checkpoint to the same end (UserError: it is damaged, or
-    another run's). Returns (curve rows, seconds). playing, workers: of the own episodes [D8]."""
-    def play_own(first, count):
-        seeds = training_seeds(distiller.seed, "own episode", first, count)
-        return play(distiller.student, settings["task"], playing, seeds, workers,
-                    "the student plays")[:2]
-
+    another run's). Returns (curve rows, seconds). workers: that play the expert's episodes [D8]."""
     checkpoint, config, curve, before = out / "checkpoint.npz", distiller.config, [], 0.0
     if checkpoint.exists():
         header, arrays = read_npz(checkpoint, ("checkpoint",))
@@ -1727,15 +1874,17 @@ def train_student(distiller, out, settings, playing, workers):
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise UserError(f"{checkpoint}: damaged ({error!r}); delete it to start anew") from None
     began = saved = time.time()
+    if not distiller.t and config.expert_episodes:
+        distiller.add(*expert_episodes(distiller, settings["task"], planning, workers))
     every, losses = max(1, min(250, config.steps // 8)), []
     with progress("distilling", config.steps, "step", distiller.t) as bar:
-        for found in distiller.run(play_own):
+        for found in distiller.run():
             losses.append(found)
             bar.update()
             if distiller.t % every and distiller.t < config.steps:
                 continue
             means, losses = np.mean(losses, 0).tolist(), []
-            q, g = (x.tolist() for x in rank_correlation(distiller, 64, playing.discount))
+            q, g = (x.tolist() for x in rank_correlation(distiller, 64, planning.discount))
             check_finite({"weights are": distiller.optimizer.vector,
                           "student's predictions are": q}, distiller.t, config.lr)
             seconds = before + time.time() - began
@@ -1841,9 +1990,10 @@ def read_records(path):
 
 def record_key(model, config, seed):
     """What recorded returns depend on: weights, planner and the episodes' seed."""
-    repeat = ("" if config.action_repeat == ACTION_REPEAT else
-              f", action repeat {config.action_repeat}")
-    return f"weights {checksum(model.params.values())}, evaluation seed {seed}, {config}{repeat}"
+    more = [f", {f.name.replace('_', ' ')} {value}" for f in dataclasses.fields(config)
+            if not f.repr and (value := getattr(config, f.name)) != f.default]
+    return (f"weights {checksum(model.params.values())}, evaluation seed {seed}, {config}" +
+            "".join(more))
 
 
 def software():
@@ -1866,24 +2016,28 @@ def record_returns(path, model, config, seed, returns):
 def command_distill(args):
     """distill: expert and replay in, student, learning curve, table and JSON out."""
     began = time.time()
-    preset = paper_preset if args.preset == "paper" else lambda config: {}
+    preset = functools.partial(preset_values, preset=args.preset)
     config = from_args(DistillConfig, args, **preset(DistillConfig))
     expert, header, replay, path = load_data(args)
-    own = from_args(PlannerConfig, args, **{**preset(PlannerConfig), **made_for(header, path)})
-    planning = dataclasses.replace(own, horizon=config.horizon)  # the student's
+    theirs = {**preset(PlannerConfig), **made_for(header, path)}
+    own = PlannerConfig(**theirs)  # the expert's
+    around = args.preset == "default" and getattr(args, "PlannerConfig.prior") != "none"
+    planning = from_args(PlannerConfig, args, **theirs, **(STUDENT_PLANNING if around else {}))
+    planning = dataclasses.replace(planning, horizon=config.horizon)
     out = Path(args.out or f"runs/{args.task}-{args.seed}")
     record = read_records(path).get(record_key(expert, own, args.eval_seed), ([], {}))
     with contextlib.closing(Distiller(expert, replay, config, args.num_agents,
                                       args.seed)) as distiller, locked(out):
-        for model, config in (both := ((expert, own), (distiller.student, planning))):
+        for model, config in ((expert, own), (distiller.student, planning)):
             check_memory(planning_numbers(model.config, config), config, model.config)
-        result = distil_and_save(distiller, args, planning, header, out)
+        result, planning = distil_and_save(distiller, args, planning, header, out)
         obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
+        both = (expert, own), (distiller.student, planning)
         result.update(evaluate_both(*both, record, args))
         result.update(time_both(*both, obs))
         result["seconds_total"] = round(time.time() - began, 1)
         write_json(out / "result.json", result)
-    report(result, planning, args.eval_seed)
+    report(result, (own, planning), args.eval_seed)
     return result
 
 
@@ -1907,13 +2061,12 @@ def load_data(args):
 
 
 def distil_and_save(distiller, args, planning, header, out):
-    """Algorithm 1 to its end; writes student, curve and configuration. Returns result's part."""
+    """Algorithm 1 to its end; writes student, curve and configuration. Returns result's part, and
+    the planning with the width of its search."""
     student, config, replay = distiller.student, distiller.config, distiller.replay
-    playing = dataclasses.replace(planning, **OWN_BUDGET)
     settings = {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
                 "distill": asdict(config), "data": data_checksums(distiller.expert, replay),
-                "action_repeat": planning.action_repeat,
-                "own_planner": asdict(playing) if config.own_episodes else None}
+                "action_repeat": planning.action_repeat}
     if (path := out / "student.npz").exists():  # a run that this one would replace
         before, _ = read_npz(path, ("student",))
         same_settings({key: before.get(key) for key in settings}, settings, path)
@@ -1923,15 +2076,21 @@ def distil_and_save(distiller, args, planning, header, out):
     print(f"{args.task}: {student.config.num_agents} agents, {len(distiller.optimizer.vector):,} "
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
-    curve, seconds = train_student(distiller, out, settings, playing, args.workers)
-    save_model(out / "student.npz", student, {"kind": "student", **settings,
-                                              "training": header.get("training", {})})
+    curve, seconds = train_student(distiller, out, settings, planning, args.workers)
+    width, gains = planning.max_std, None
+    if planning.prior == "policy" and getattr(args, "PlannerConfig.max_std") is None:
+        width, gains = search_width(distiller, planning)
+    planning = dataclasses.replace(planning, max_std=width)
+    save_model(out / "student.npz", student, {
+        "kind": "student", **settings, "training": header.get("training", {}),
+        "planner": {name: getattr(planning, name) for name in STUDENT_PLANNING}})
     write_json(out / "config.json", {**settings, "planner": asdict(planning)})
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
             "steps": config.steps, "seconds": round(seconds, 1), "kl_reward": curve[-1][3],
             "kl_value": curve[-1][4], **rank_results(distiller, 256, planning.discount),
-            "out": str(out),
-            "picture": draw_curve(out / "curve.png", curve, f"{args.task}, seed {args.seed}")}
+            "search_width": width, "plan_gains": gains, "out": str(out),
+            "picture": draw_curve(out / "curve.png", curve,
+                                  f"{args.task}, seed {args.seed}")}, planning
 
 
 def evaluate_both(expert, student, record, args):
@@ -1946,7 +2105,10 @@ def evaluate_both(expert, student, record, args):
     recorded = len(experts) >= args.episodes and not args.evaluate_expert
     experts, versions = (experts[:args.episodes], versions) if recorded else (
         returns_of(*expert, "evaluating the expert"), software())
-    return {"episodes": args.episodes, "eval_seed": args.eval_seed, "expert_recorded": recorded,
+    policy = dataclasses.replace(expert[1], prior="policy", iterations=0)
+    return {"policy_returns": returns_of(expert[0], policy, "evaluating its policy alone")
+            if expert[0].has_policy else None,
+            "episodes": args.episodes, "eval_seed": args.eval_seed, "expert_recorded": recorded,
             "expert_versions": versions, "expert_horizon": expert[1].horizon,
             "student_horizon": student[1].horizon,
             "expert_return_mean": float(np.mean(experts)),
@@ -1970,24 +2132,29 @@ def time_both(expert, student, obs):
             "speedup": central / best, "plan_workers": beside if best < alone else 0}
 
 
-def report(result, planning, eval_seed):
-    """Print distill's table."""
+def report(result, plannings, eval_seed):
+    """Print distill's table. plannings: the expert's and the student's."""
     expert, student = (f"{result[f'{kind}_return_mean']:.0f} ± {result[f'{kind}_return_std']:.0f}"
                        for kind in ("expert", "student"))
     source = "measured now" if not result["expert_recorded"] else "recorded" if (
         result["expert_versions"] == software()) else "recorded with other versions"
     horizons = [result[f"{kind}_horizon"] for kind in ("expert", "student")]
     over = [f", H = {h}" if horizons[0] != horizons[1] else "" for h in horizons]
-    rows = [(f"expert ({source}), one process{over[0]}", expert, result["plan_ms_expert"]),
-            (f"student, N = {result['num_agents']}, one process{over[1]}", student,
+    budgets = [f"{config.samples} x {config.iterations}" for config in plannings]
+    rows = [(f"expert ({source}), one process{over[0]}", budgets[0], expert,
+             result["plan_ms_expert"]),
+            (f"student, N = {result['num_agents']}, one process{over[1]}", budgets[1], student,
              result["plan_ms_student_in_process"]),
-            (f"student, workers beside: {result['plan_workers']}", "the same plans",
+            (f"student, workers beside: {result['plan_workers']}", "", "the same plans",
              result["plan_ms_student"])][:3 if result["plan_workers"] else 2]
-    print(f"\n{result['task']}, {result['episodes']} episodes, evaluation seed {eval_seed}, MPPI "
-          f"with {planning.samples} samples, {planning.iterations} iterations, horizon "
-          f"{' and '.join(map(str, dict.fromkeys(horizons)))}\n")
-    print_table([("", "return", "ms a decision", "speed-up")] + [
-        (name, returns, f"{ms:.1f}", f"{rows[0][2] / ms:.1f}") for name, returns, ms in rows])
+    print(f"\n{result['task']}, {result['episodes']} episodes, evaluation seed {eval_seed}, "
+          f"horizon {' and '.join(map(str, dict.fromkeys(horizons)))}\n")
+    table = [(name, budget, returns, f"{ms:.1f}", f"{rows[0][3] / ms:.1f}")
+             for name, budget, returns, ms in rows]
+    if policy := result["policy_returns"]:
+        table.insert(1, ("its policy alone", "0", f"{np.mean(policy):.0f} ± {np.std(policy):.0f}",
+                         "", ""))
+    print_table([("", "MPPI", "return", "ms a decision", "speed-up"), *table])
     q, g, known, error = (result[f"rank_correlation_{key}"] for key in (
         "by_step", "returns", "returns_training", "returns_se"))
     kept = "-" if result["kept"] is None else f"{result['kept']:.2f}"
@@ -1996,6 +2163,10 @@ def report(result, planning, eval_seed):
           f" (standard error over {result['rank_correlation_episodes']} held-out episodes; "
           f"{known[-1]:.3f} in states of training), distilled in {result['seconds']:.0f} s, "
           f"{result['seconds_total']:.0f} s in all, {result['out']}/")
+    for width, gain, se, promise in result["plan_gains"] or ():
+        if width == result["search_width"]:
+            print(f"plans around the policy, deviation {width}: {gain:.2f} ± {se:.2f} above it by "
+                  f"the expert's G in held-out states, {promise:.2f} by the student's")
     print("" if result["picture"] else "pip install 'fac-tdmpc-ref[plots]' draws curve.png, too")
 
 
@@ -2060,10 +2231,10 @@ def from_args(config_class, args, **defaults):
     return config_class(**{**defaults, **{k: v for k, v in given.items() if v is not None}})
 
 
-def paper_preset(config_class):
-    """The paper's value of every field that departs from it."""
-    return {f.name: f.metadata["paper"] for f in dataclasses.fields(config_class)
-            if "paper" in f.metadata}
+def preset_values(config_class, preset):
+    """What a preset takes instead of the default of a config's fields."""
+    return {f.name: f.metadata[preset] for f in dataclasses.fields(config_class)
+            if preset in f.metadata}
 
 
 def natural(text, least=0):
@@ -2101,8 +2272,9 @@ def make_parser():
     add("--task", default="reacher-hard", help="one of: " + ", ".join(TASKS))
     add("--seed", type=natural, default=0, help="of distillation [0]")
     add("--num-agents", type=int, help="N, a divisor of dim(A) [dim(A)]")
-    add("--preset", choices=("default", "paper"), default="default", help="paper: the paper's "
-        "value of every setting that names one below (days on a laptop)")
+    add("--preset", choices=("default", "plain", "paper"), default="default", help="paper: the "
+        "paper's value of every setting that names one below (days on a laptop); plain: the "
+        "paper's method at this project's budget, without what it adds [D8] [D9]")
     add("--expert", help="expert file, or a folder with expert.npz and replay.npz [data/TASK]")
     add("--replay", help="replay file [replay.npz beside the expert]")
     add("--out", help="folder for the results [runs/TASK-SEED]")
@@ -2112,7 +2284,8 @@ def make_parser():
     add("--episodes", type=positive, default=20, help="evaluation episodes [20]")
     add("--workers", type=natural, help="processes that play episodes; 0: this one [cores]")
     add_config(sub, DistillConfig)
-    add_config(sub, PlannerConfig, prefix="plan-", skip=("horizon", "action_repeat"))
+    add_config(sub, PlannerConfig, "How the student plans; the expert does with its own defaults",
+               "plan-", ("horizon", "action_repeat"), **STUDENT_PLANNING)
 
     sub = add_command(commands, "evaluate", command_evaluate, "Plan with a model (expert or "
                       "student) through whole episodes.")

@@ -35,22 +35,25 @@ def consistency_loss(student, features, actions, targets, config, grads=None):
 
     That is the mean of |s_{h+1} - f_E(g_{h+1})|^2 over features, with the student's encoding,
     held fixed, of the last of `targets`: what the student reads of the expert's own rollout."""
-    *targets, after = targets  # (L, B, K, F)
-    tapes, encoder_tape, weight = defaultdict(list), [], 2.0
+    *targets, after = targets  # (F, L, B, K)
+    tapes, encoder_tape, end_tape, weight = defaultdict(list), [], [], 2.0
     z = student.encode_features(features, encoder_tape)
     L, _, B, K = actions.shape
-    x, end = fac.unroll(student, z, actions, L, tapes)
-    (loss, *means), d_outputs = fac.divergences(fac.run_heads(student, x, actions, tapes), targets,
-                                                config)
+    x, now = fac.unroll(student, z, actions, tapes), slice(-B * K, None)
+    (loss, *means), d_shares = fac.divergences(fac.run_heads(student, x, actions, tapes), targets,
+                                               config)
+    end = fac.forward(fac.MLP, student.params, "_dynamics", x[:, :, now], end_tape)
     n, m = student.config.num_agents, student.config.latent_dim
     own = np.concatenate([x[:, :m, B * K:], end], 2)
-    goal = student.encode_features(np.ascontiguousarray(after.reshape(1, -1, after.shape[-1])
-                                                        .swapaxes(1, 2)))
+    goal = student.encode_features(after.reshape(1, len(after), -1))
     lam = np.repeat(config.lam ** np.arange(L), B * K).astype(z.dtype)
     gap, scale = own - goal, weight / (n * m * B * K)
     if grads is not None:
-        d_latents = (2 * scale * lam * gap).reshape(n, m, L, -1).transpose(2, 0, 1, 3)
-        dz = fac.predict_backward(student, tapes, d_outputs, grads, d_latents)
+        d, dx = 2 * scale * lam * gap, fac.heads_backward(student, tapes, d_shares, grads)
+        dx[:, :m, B * K:] += d[:, :, :-B * K]
+        dx[:, :, now] += fac.backward(fac.MLP, student.params, "_dynamics", end_tape,
+                                      d[:, :, now], grads)
+        dz = fac.unroll_backward(student, tapes, actions, dx, grads)
         fac.backward(fac.ENCODER, student.params, "_encoder", encoder_tape,
                      dz.reshape(1, -1, B), grads)
     return loss + float(scale * (lam * gap ** 2).sum()), *means
@@ -62,12 +65,13 @@ class ConsistentDistiller(fac.Distiller):
     loss = staticmethod(consistency_loss)
 
     def draw(self, number, part, size):
-        """As Distiller's; the targets are followed by the expert's latents (L, B, K, F)."""
+        """As Distiller's; the targets are followed by the expert's latents (F, L, B, K)."""
         features, actions, targets = super().draw(number, part, size)
         steps, _, *columns = actions.shape
-        x, end = fac.unroll(self.expert, features, actions, steps)
-        after = np.concatenate([x[:, :features.shape[1], np.prod(columns):], end], 2)[0]
-        return features, actions, [*targets, after.T.reshape(steps, *columns, -1)]
+        x = fac.unroll(self.expert, features, actions)
+        end = fac.forward(fac.MLP, self.expert.params, "_dynamics", x[:, :, -np.prod(columns):])
+        after = np.concatenate([x[:, :features.shape[1], np.prod(columns):], end], 2)
+        return features, actions, [*targets, after.reshape(-1, steps, *columns)]
 
 
 def small_distiller(expert, replay, config, _, seed):
@@ -163,13 +167,8 @@ class TapDistiller(fac.Distiller):
             inputs.append(np.concatenate([s, self.vae.decode(s[0], latent[-1])[None]], 1))
         latent = np.stack(latent).reshape(L, -1, B, K)
         features = z if student.config.expert_latent_dim else obs[None]
-        return features, latent, fac.run_heads(expert, np.concatenate(inputs, 2), latent)
-
-    def add(self, observation, action):
-        """As Distiller's, of latent actions (E, T, 2): `perturb` takes the robot's."""
-        s = self.expert.encode(observation.reshape(-1, observation.shape[2]).T)[0]
-        action = self.vae.decode(s, action.reshape(-1, LATENT_ACTION).T).T
-        super().add(observation, action.reshape(*observation.shape[:2], -1))
+        return features, latent, [
+            y.sum(0) for y in fac.run_heads(expert, np.concatenate(inputs, 2), latent)]
 
 
 class DecodingEnvironment(fac.Environment):

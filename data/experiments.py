@@ -254,7 +254,7 @@ def run_all(args, function, runs):
 
 def planning_for(header, about):
     """A model's own planning but for what a run's settings say of it."""
-    own = {k: about[k] for k in ("samples", "iterations", "horizon") if k in about}
+    own = {k: about[k] for k in ("horizon", *fac.STUDENT_PLANNING) if k in about}
     return fac.PlannerConfig(**{**fac.made_for(header, "model"), **own})
 
 
@@ -276,19 +276,17 @@ def distil(task, seed, case, settings):
     expert, header = fac.load_model(fac.data_file(task, "expert.npz"))
     distiller = distiller_of(case)(expert, fac.Replay(fac.data_file(task, "replay.npz")), config,
                                    own["num_agents"], seed)
-    planning = planning_for(header, {**about, "horizon": config.horizon})
-    playing = dataclasses.replace(planning, **fac.OWN_BUDGET)
+    around = fac.STUDENT_PLANNING if config.targets == "credit" else {}
+    planning = planning_for(header, {**around, **about, "horizon": config.horizon})
     student, environment = distiller.student, None
-    if case == "TAP":  # whose actions are others
+    if case == "TAP":  # whose actions are others, which the expert's policy doesn't know
         environment = DecodingEnvironment(task, expert, distiller.vae, planning.action_repeat)
-
-    def play_own(first, count):
-        seeds = fac.training_seeds(seed, "own episode", first, count)
-        return fac.play(student, task, playing, seeds, 0, "the student plays", environment)[:2]
-
+        planning = dataclasses.replace(planning, prior="none", max_std=2.0)
     every = -(-config.steps // own["evaluations"])
     with contextlib.closing(distiller):
-        for _ in distiller.run(play_own):
+        if config.expert_episodes:
+            distiller.add(*fac.expert_episodes(distiller, task, planning, 0))
+        for _ in distiller.run():
             if distiller.t % every and distiller.t < config.steps:
                 continue
             row = measure(student, task, planning, own["episodes"], environment)
@@ -300,7 +298,7 @@ def distil(task, seed, case, settings):
 
 FIGURE4 = {"Fac-TDMPC": {}, "100% TD-MPC": {"num_agents": 1}, "10% TD-MPC": {}, "TAP": {}}
 FIGURE5 = {  # panel: {case: settings}; every panel holds the default
-    "loss": {"default": {}, "MSE": {}},
+    "loss": {"default": {}, "MSE": {"targets": "joint"}},
     "noise deviation": {"default": {}, **{f"noise {x}": {"noise_std": x} for x in (0.1, 1.0, 2.0)}},
     "student temperature": {"default": {}, **{f"T_s {x}": {"temperature_student": x}
                                               for x in (0.1, 2.0)}},
@@ -373,9 +371,10 @@ def command_departures(args):
 
 def command_students(args):
     """students: what `distill` makes by default, for the README's main table."""
-    preset = fac.paper_preset if args.preset == "paper" else lambda config: {}
-    defaults = {"steps": fac.DistillConfig(**preset(fac.DistillConfig)).steps,
-                **vars(fac.PlannerConfig(**preset(fac.PlannerConfig)))}
+    values = functools.partial(fac.preset_values, preset=args.preset)
+    defaults = {"steps": fac.DistillConfig(**values(fac.DistillConfig)).steps,
+                **vars(fac.PlannerConfig(**values(fac.PlannerConfig))),
+                **(fac.STUDENT_PLANNING if args.preset == "default" else {})}
     about = {k: getattr(args, k) or defaults[k] for k in ("steps", "samples", "iterations")}
     data = {task: data_checksums(task) for task in args.tasks}
     return run_all(args, functools.partial(students.distil_student, students=args.students), [
@@ -864,7 +863,7 @@ def make_parser():
                    "the README's main table: evaluation seeds 0 and 1, and the expert's policy "
                    "alone.", shipped, episodes=20)
     sub.add_argument("--students", default="runs", help="leave them in TASK-SEED/ there [runs]")
-    sub.add_argument("--preset", choices=("default", "paper"), default="default",
+    sub.add_argument("--preset", choices=("default", "plain", "paper"), default="default",
                      help="distill's: a column of the table for each [default]")
     for name in ("steps", "samples", "iterations"):
         sub.add_argument(f"--{name}", type=positive, help="distill's [the preset's]")

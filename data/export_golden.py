@@ -50,14 +50,15 @@ def last(x):
 
 
 def rollout(params, z, actions):
-    """Global rewards and both Q, three (L, B, K): actions (L, A, B, K), z (N, B, m)."""
+    """Shares of reward and both Q, three (N, L, B, K): actions (L, A, B, K), z (N, B, m)."""
     steps, _, batch, noise = actions.shape
     z, outputs = z.repeat_interleave(noise, 1), []
     for h in range(steps):
         x = torch.cat([z, actions[h].reshape(len(z), -1, batch * noise).mT], -1)
-        outputs.append([output.view(batch, noise) for output in heads(params, x)])
+        outputs.append([network(kinds, params, name, x).view(-1, batch, noise)
+                        for name, kinds in fac.HEADS])
         z = transition(params, x)
-    return [torch.stack(head) for head in zip(*outputs)]
+    return [torch.stack(head, 1) for head in zip(*outputs)]
 
 
 def latents(params, features, agents):
@@ -67,16 +68,19 @@ def latents(params, features, agents):
 
 
 def equation_4(params, features, actions, targets, agents, config):
-    """Algorithm 1's loss; features (1, F, B), targets: the expert's three (L, B, K)."""
+    """Algorithm 1's loss; features (1, F, B), targets: the expert's three (L, B, K), or each
+    agent's parts of these, (N, L, B, K)."""
     loss, coefs = 0.0, (config.reward_coef, config.value_coef, config.value_coef)
     students = rollout(params, latents(params, features, agents), actions)
     for coef, student, expert in zip(coefs, students, targets):
+        expert = expert.reshape(-1, *student.shape[1:])
+        student = student.reshape(len(expert), -1, *student.shape[1:]).sum(1)
         log_s = F.log_softmax(student / config.temperature_student, -1)
         log_e = F.log_softmax(expert / config.temperature_expert, -1)
         to, of = (log_s, log_e) if config.kl == "forward" else (log_e, log_s)
         kl = F.kl_div(to, of, reduction="none", log_target=True).sum(-1)
-        for h in range(len(kl)):
-            loss = loss + coef * config.lam ** h * kl[h].mean()
+        for h in range(kl.shape[1]):
+            loss = loss + coef * config.lam ** h * kl[:, h].sum(0).mean()
     return loss
 
 
@@ -164,7 +168,7 @@ def student_golden(expert, student, g, agents, config):
     theirs, params, actions = trainable(expert), trainable(student), double(g["kl_actions"])
     with torch.no_grad():
         z = latents(theirs, double(g["kl_obs"])[None], 1)
-        targets = rollout(theirs, z, actions)
+        targets = [shares.sum(0) for shares in rollout(theirs, z, actions)]
 
     def loss():
         return equation_4(params, z.mT, actions, targets, agents, config)
@@ -231,7 +235,7 @@ def narrow_golden(g, tag, agents, config):
     features, actions, targets = (double(g[f"{tag} {k}"]) for k in ("features", "actions",
                                                                     "targets"))
     with torch.no_grad():
-        outputs = torch.stack(rollout(params, latents(params, features, agents), actions))
+        outputs = torch.stack(rollout(params, latents(params, features, agents), actions)).sum(1)
 
     def loss():
         return equation_4(params, features, actions, targets, agents, config)

@@ -284,6 +284,8 @@ def command_agreement(args):
     _, held_out = replay.starts(1, share, fac.count(header.get("seed", 0), f"{args.model}: seed"))
     obs, actions = replay.sequences(rng.choice(held_out, args.states), 1)
     known = agreement(student, expert, obs, actions[0], rng)
+    gain, promise = (x.mean().item() for x in fac.plan_gains(expert, student, config, obs)
+                     ) if expert.has_policy else (None, None)
     played, done, rewards, _ = fac.play(student, task, config,
                                         fac.episode_seeds(args.seed, args.episodes))
     worst = int(rewards.sum(1).argmin())
@@ -301,10 +303,14 @@ def command_agreement(args):
     fac.save_figure(args.out, figure)
     result = {"out": args.out, "task": task, "held_out": known.mean(1).tolist(),
               "worst_episode": own.mean(1).tolist(), "when": when.tolist(),
-              "return_worst": float(rewards[worst].sum())}
+              "return_worst": float(rewards[worst].sum()), "plan_gain": gain,
+              "plan_promise": promise}
     fac.print_table([("joint", *map(str, range(len(own)))), *(
         (name, *(f"{x:.2f}" for x in result[key]))
         for name, key in (("held-out states", "held_out"), ("worst episode", "worst_episode")))])
+    if expert.has_policy:
+        print(f"a plan promises {promise:.2f} above the expert's policy, by the student's G; by "
+              f"the expert's it is worth {gain:.2f}")
     print(args.out)
     return result
 

@@ -64,25 +64,30 @@ def equation_1(model, obs, actions, reward, latents, td, config, grads=None):
     Returns the loss, its three sums over h without coefficients, and the rollout s_0, ..., s_H
     (1, m, (H + 1) * B)."""
     H, _, B = actions.shape
-    tapes, encoder_tape, actions = defaultdict(list), [], actions[..., None]  # K = 1
+    tapes, encoder_tape, end_tape, actions = defaultdict(list), [], [], actions[..., None]  # K = 1
     z = model.encode_features(obs[None], encoder_tape)
-    x, end = fac.unroll(model, z, actions, H, tapes)
-    rollout = np.concatenate([x[:, :z.shape[1]], end], 2)
+    m, x = z.shape[1], fac.unroll(model, z, actions, tapes)
+    end = fac.forward(fac.MLP, model.params, "_dynamics", x[:, :, -B:], end_tape)
+    rollout = np.concatenate([x[:, :m], end], 2)
     lam = (config.lam ** np.arange(H) / B).astype(z.dtype)[:, None]
-    terms, d_outputs = [], []
+    terms, d_shares = [], []
     coefs = (config.reward_coef, config.value_coef, config.value_coef)
-    for coef, output, goal in zip(coefs, fac.run_heads(model, x, actions, tapes), (reward, td, td)):
-        error = output[..., 0] - goal
+    for coef, shares, goal in zip(coefs, fac.run_heads(model, x, actions, tapes), (reward, td, td)):
+        error = shares.sum(0)[..., 0] - goal
         terms.append(float((lam * error ** 2).sum()))
-        d_outputs.append((2 * coef / H * lam * error)[..., None])
+        d_shares.append((2 * coef / H * lam * error)[None, ..., None])
     gap = (rollout[:, :, B:] - latents).reshape(*z.shape[:2], H, B)
-    lam = lam / z.shape[1]
+    lam = lam / m
     terms.insert(0, float((lam * gap ** 2).sum()))
     terms = [terms[0], terms[1], terms[2] + terms[3]]
     loss = np.dot(terms, [config.consistency_coef, config.reward_coef, config.value_coef]) / H
     if grads is not None:
-        d_latents = 2 * config.consistency_coef / H * lam * gap
-        dz = fac.predict_backward(model, tapes, d_outputs, grads, d_latents.transpose(2, 0, 1, 3))
+        d_latents = (2 * config.consistency_coef / H * lam * gap).reshape(1, m, -1)  # of s_1 .. s_H
+        dx = fac.heads_backward(model, tapes, d_shares, grads)
+        dx[:, :m, B:] += d_latents[:, :, :-B]
+        dx[:, :, -B:] += fac.backward(fac.MLP, model.params, "_dynamics", end_tape,
+                                      d_latents[:, :, -B:], grads)
+        dz = fac.unroll_backward(model, tapes, actions, dx, grads)
         fac.backward(fac.ENCODER, model.params, "_encoder", encoder_tape, dz, grads)
     return float(loss), terms, rollout
 

@@ -181,7 +181,8 @@ def speedups(prediction, decision, planning):
 
 def command_table3(args):
     """table3: the networks and whole decisions on this machine."""
-    planning = fac.from_args(fac.PlannerConfig, args, **fac.paper_preset(fac.PlannerConfig))
+    planning = fac.from_args(fac.PlannerConfig, args,
+                             **fac.preset_values(fac.PlannerConfig, "paper"))
     args.robots = list(dict.fromkeys(args.robots))
     if args.command == "figure6":
         args.figure = args.figure or fac.DATA / "figures" / "figure6.png"
@@ -268,4 +269,4 @@ def add_commands(commands):
                      help="timings; of decisions a tenth [100]")
     sub.add_argument("--figure", help="draw it into this file [figure6: data/figures/figure6.png]")
     fac.add_config(sub, fac.PlannerConfig, skip=("pi_trajs", "action_repeat"),
-                   **fac.paper_preset(fac.PlannerConfig))
+                   **fac.preset_values(fac.PlannerConfig, "paper"))

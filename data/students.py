@@ -10,6 +10,7 @@ import fac_tdmpc_ref as fac  # noqa: E402
 from tables import deviation, markdown, of_returns  # noqa: E402
 
 EVALUATION_SEEDS = (0, 1)
+MEASURED = ("rank_correlation", "search_width", "plan_gains", "plan_ms")  # what a row keeps
 SOLVED = 100  # what an expert gets in an episode that it solves
 FLAGS = {"samples": "plan-samples", "iterations": "plan-iterations", "num_agents": "num-agents"}
 
@@ -23,32 +24,19 @@ def distil_student(task, seed, preset, settings, students):
     """Distil a student by `distill`, which leaves it in `students`, once; a row for each evaluation
     seed. settings: of FLAGS, `steps` and `episodes`."""
     flags = [f"--{FLAGS.get(name, name)}={value}" for name, value in settings.items()]
-    expert, _ = fac.load_model(fac.data_file(task, "expert.npz"))
     for evaluation_seed in reversed(EVALUATION_SEEDS):  # the first's result.json stays
         args = fac.make_parser().parse_args([
             "distill", "--task", task, "--seed", str(seed), "--preset", preset, "--workers", "0",
             "--out", str(folder(students, task, seed, preset)), *flags,
             "--eval-seed", str(evaluation_seed)])
         found = args.run(args)
-        policy = policy_returns(expert, task, fac.episode_seeds(evaluation_seed, args.episodes))
         yield {"step": found["steps"], **of_returns(found["student_returns"], evaluation_seed),
                "expert_mean": found["expert_return_mean"], "rank_q": found["rank_correlation"],
                "rank_return": found["rank_correlation_returns"][-1],
                "expert_returns": np.round(found["expert_returns"], 3).tolist(),
-               "policy_returns": np.round(policy, 3).tolist(), "minutes": found["seconds"] / 60,
-               "ranks": {k: v for k, v in found.items() if k.startswith("rank_correlation")}}
-
-
-def policy_returns(expert, task, seeds):
-    """Returns of episodes in which an expert's policy acts, without planning; [] if it has none."""
-    environment, returns = fac.Environment(task), []
-    for seed in seeds if expert.has_policy else []:
-        obs, total = environment.reset(seed), 0.0
-        for _ in range(fac.EPISODE_STEPS):
-            obs, reward = environment.step(expert.policy(expert.encode(obs[:, None]))[0, :, 0])
-            total += reward
-        returns.append(total)
-    return returns
+               "policy_returns": np.round(found["policy_returns"] or [], 3).tolist(),
+               "minutes": found["seconds"] / 60,
+               "ranks": {k: v for k, v in found.items() if k.startswith(MEASURED)}}
 
 
 def mean_and_spread(values, spread):

@@ -30,8 +30,8 @@ from numpy_learner import ExpertConfig, Learner, named, restore  # noqa: E402
 # for a few cores; hidden layers of 512, as in Table 2, make an update three times as dear
 TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
 # settings of distill that say nothing where an expert still learns
-NOT_ONLINE = ("steps", "reuse", "own_episodes", "held_out")
-FOLLOWING_DEFAULTS = {"own_episodes": 0}  # as many as the expert plays instead, each round
+NOT_ONLINE = ("steps", "reuse", "expert_episodes", "held_out")
+FOLLOWING_DEFAULTS = {"expert_episodes": 0}  # the student's own instead, each round
 TORCH_ONLY = {"device": None, "precision": "float32", "threads": 1}  # and their defaults
 FINGER_RADIUS, REACHER_LINK = 0.01, 0.09  # of data/reacher.xml, metres
 LOSSES = ("consistency", "reward", "value", "kl_reward", "kl_value")
@@ -236,14 +236,13 @@ class OnlineStudent:
         (H, A, B); its divergences."""
         config, t, L = self.config, self.optimizer.t, self.config.horizon + 1
         rng, obs = fac.stream(self.seed, "perturbations", t), obs[:, :config.batch_size]
-        actions = np.repeat(actions[:L, :, :config.batch_size, None], config.noise_samples, -1)
+        actions = actions[:L, :, :config.batch_size].copy()
         if len(self.own):
-            mine = slice(int(config.own_share * obs.shape[1]))
+            mine = slice(int(config.played_share * obs.shape[1]))
             found, played, *_ = self.own.sample(rng, mine.stop, L)
-            obs[:, mine] = found[0]
-            actions[:, :, mine] = fac.own_actions(expert, found[0], played, config.noise_samples,
-                                                  rng)
-        batch = fac.perturbed_batch(expert, self.model, obs, actions, config, rng)
+            obs[:, mine], actions[:, :, mine] = found[0], played
+        actions = fac.around_policy(expert, obs, actions, config.policy_share, rng)
+        batch = fac.perturbed_batch(expert, self.model, obs, actions[..., None], config, rng)
         _, *divergences = fac.distill_loss(self.model, *batch, config, self.optimizer.grads)
         self.optimizer.step(fac.learning_rate(config, t), config.grad_clip)
         return divergences
@@ -364,7 +363,7 @@ class Training:
         """A round's training episodes, then as many of the student's own, as `Actors.begin` takes
         them."""
         first, std = self.decisions // fac.EPISODE_STEPS, self.scheduled()["exploration_std"]
-        follows = self.student and self.student.config.own_share and not self.warming
+        follows = self.student and self.student.config.played_share and not self.warming
         return [(seed, player, deviation) for use, player, deviation, count in (
             ("training episode", "explorer", std, self.args.envs),
             ("own episode", "own", 0.0, self.args.envs if follows else 0))

@@ -25,7 +25,7 @@ SCRIPT = ROOT / "fac_tdmpc_ref.py"
 STEPS = 6
 BUDGET = ["--samples", "16", "--iterations", "1"]
 TINY = ["--steps", str(STEPS), "--batch-size", "4", "--horizon", "1", "--held-out", "0.34",
-        "--warmup", "2", "--own-episodes", "0", "--episodes", "1", "--plan-samples", "16",
+        "--warmup", "2", "--expert-episodes", "0", "--episodes", "1", "--plan-samples", "16",
         "--plan-iterations", "1"]
 # BLAS threads that wait for a busy core make runs many times longer
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
@@ -181,7 +181,9 @@ def configs_of(monkeypatch, *arguments):
 
 
 def test_default_settings_are_those_of_the_dataclasses(monkeypatch):
-    assert configs_of(monkeypatch, "distill") == (fac.DistillConfig(), fac.PlannerConfig())
+    assert configs_of(monkeypatch, "distill") == (
+        fac.DistillConfig(), fac.PlannerConfig(**fac.STUDENT_PLANNING))
+    assert configs_of(monkeypatch, "distill", "--plan-prior", "none")[1:] == (fac.PlannerConfig(),)
     assert configs_of(monkeypatch, "evaluate", "--model", "x") == (fac.PlannerConfig(),)
 
 
@@ -193,15 +195,26 @@ def test_preset_paper_is_the_paper(monkeypatch):
                 "kl": "reverse", "encoder_input": "observation", "lr": 1e-4,
                 "lr_schedule": "constant", "warmup": 0, "grad_clip": 10,
                 "noise_std": 0.5, "clip_actions": False,
-                "reuse": 1, "own_episodes": 0, "own_share": 0}
+                "reuse": 1, "expert_episodes": 0, "played_share": 0, "policy_share": 0,
+                "targets": "joint"}
     assert {k: found[k] for k in expected} == expected
     assert (planner.samples, planner.iterations, planner.num_elites, planner.pi_trajs,
             planner.horizon, planner.discount) == (512, 6, 64, 24, 3, 0.99)
+    assert (planner.prior, planner.max_std, planner.output) == ("none", 2.0, "mean")
+
+
+def test_preset_plain_is_the_paper_s_method_at_our_budget(monkeypatch):
+    ours, *_ = configs_of(monkeypatch, "distill")
+    config, planner = configs_of(monkeypatch, "distill", "--preset", "plain")
+    changed = {k: v for k, v in dataclasses.asdict(config).items() if v != getattr(ours, k)}
+    assert changed == {"targets": "joint", "policy_share": 0, "expert_episodes": 0,
+                       "played_share": 0, "noise_std": 0.5}
+    assert planner == fac.PlannerConfig()
 
 
 def test_flags_go_before_the_preset(monkeypatch):
-    config, _ = configs_of(monkeypatch, "distill", "--preset", "paper", "--steps", 7, "--kl",
-                           "forward")
+    config, *_ = configs_of(monkeypatch, "distill", "--preset", "paper", "--steps", 7, "--kl",
+                            "forward")
     assert (config.steps, config.kl, config.batch_size) == (7, "forward", 512)
 
 
@@ -225,10 +238,13 @@ def test_every_flag_reaches_its_setting(monkeypatch, config_class, prefix, start
         if prefix and f.name == "horizon" or f.name == "action_repeat":
             continue  # distill has one for loss and planning; a model's file says it
         (flag, *rest), value = another_value(f)
+        if prefix and f.name == "prior":
+            rest, value = ["none"], "none"
         flag = f"--no-{prefix}{flag[3:]}" if flag.startswith("no-") else f"--{prefix}{flag}"
         found = next(c for c in configs_of(monkeypatch, *start, flag, *rest)
                      if isinstance(c, config_class))
-        assert found == dataclasses.replace(config_class(), **{f.name: value})
+        default = config_class(**(fac.STUDENT_PLANNING if prefix and f.name != "prior" else {}))
+        assert found == dataclasses.replace(default, **{f.name: value})
 
 
 def test_interrupt_is_one_line_and_status_130(monkeypatch, capsys):
@@ -264,7 +280,7 @@ def refused(done, *parts, program="fac_tdmpc_ref.py"):
     (["--batch-size", "9" * 23], ["batch_size", "at least 2 and at most 10^9"]),
     (["--noise-std", "nan"], ["noise_std", "nan"]),
     (["--lr", "inf"], ["lr", "finite"]),
-    (["--own-episodes", "1", "--own-share", "0"], ["own_share", "above 0", "not 0.0"]),
+    (["--expert-episodes", "1", "--played-share", "0"], ["played_share", "above 0", "not 0.0"]),
     (["--held-out", "1"], ["held_out", "at least 0.0001 and at most 0.5"]),
     (["--held-out", "0.05"], ["replay.npz", "6 episodes are too few"]),
     (["--kl", "sideways"], ["--kl", "'sideways'", "forward"]),
@@ -379,7 +395,14 @@ def test_distill_prints_json_and_a_table(distilled):
     table = done.stdout
     assert "expert (measured now)" in table and "student, N = 3" in table and "±" in table
     assert f"{result['speedup']:.1f}" in table and "speed-up" in table
-    assert "16 samples, 1 iterations, horizon 3 and 1" in table
+    assert "horizon 3 and 1" in table and "128 x 4" in table and "16 x 1" in table
+    policy = np.mean(result["policy_returns"])
+    assert len(result["policy_returns"]) == 1 and f"{policy:.0f} ± 0" in table
+    assert result["search_width"] in fac.WIDTHS and len(result["plan_gains"]) == len(fac.WIDTHS)
+    assert f"deviation {result['search_width']}" in table
+    header, _ = fac.read_npz(folder / "student.npz", ("student",))
+    assert header["planner"] == {**fac.STUDENT_PLANNING, "samples": 16, "iterations": 1,
+                                 "max_std": result["search_width"]}
 
 
 @pytest.mark.parametrize("cores, seconds, workers, best", [
@@ -532,17 +555,18 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(killed, distilled):
     assert (student_of(out), (out / "curve.csv").read_bytes()) == before
 
 
-def test_a_killed_run_whose_student_plays_goes_on(tmp_path, files, no_plots):
-    """The student's own episodes depend on its weights alone, whoever plays them [D8]."""
+def test_a_killed_run_whose_expert_plays_goes_on(tmp_path, files, no_plots):
+    """The expert's episodes depend on the seed alone, whoever plays them [D8]."""
     def distill(out, *more, stop=-1):
-        arguments = distill_arguments(files, "--own-episodes", "2", "--out", tmp_path / out, *more)
+        arguments = distill_arguments(files, "--expert-episodes", "2", "--out", tmp_path / out,
+                                      *more)
         return launch(["-c", DRIVER, stop, *arguments], tmp_path, no_plots)
 
     succeeded(distill("whole", "--workers", "1"))
-    for stop in (3, 5):  # the student plays before steps 2, 3 and 5, counted from 0
+    for stop in (3, 5):
         assert distill("parts", "--workers", "2", stop=stop).returncode == -signal.SIGKILL
     with np.load(tmp_path / "parts" / "checkpoint.npz") as file:
-        assert file["own"].shape == (4, fac.EPISODE_STEPS, 8 + 3)  # states and actions
+        assert file["played"].shape == (2, fac.EPISODE_STEPS, 8 + 3)  # states and actions
     succeeded(distill("parts"))
     assert student_of(tmp_path / "parts") == student_of(tmp_path / "whole")
     without = distill_arguments(files, "--out", tmp_path / "without")
@@ -553,7 +577,7 @@ def test_a_killed_run_whose_student_plays_goes_on(tmp_path, files, no_plots):
 @pytest.mark.parametrize("flags, parts", [
     (["--seed", "1"], ["seed: expected 1, found 0"]),
     (["--num-agents", "1"], ["num_agents: expected 1, found 3"]),
-    (["--noise-std", "0.25"], ["noise_std: expected 0.25, found 0.5"]),
+    (["--noise-std", "0.25"], ["noise_std: expected 0.25, found 0.3"]),
     (["--expert", "{files}/other.npz"], ["(data"]),
     (["--replay", "{files}/longer.npz"], ["(data"]),
     (["--replay", "{files}/named.npz"], ["(data"]),
@@ -664,7 +688,7 @@ def test_memory_that_is_not_there_is_refused_before_hours_of_work(tmp_path, file
 def test_what_is_kept_is_the_student_s_return_by_the_expert_s(monkeypatch):
     monkeypatch.setattr(fac, "evaluate", lambda *_: {"returns": [4.0, 8.0]})
     args = SimpleNamespace(task="x", episodes=2, eval_seed=0, workers=0, evaluate_expert=False)
-    planned = None, fac.PlannerConfig()
+    planned = SimpleNamespace(has_policy=False), fac.PlannerConfig()
     found = fac.evaluate_both(planned, planned, ([9.0, 15.0, 99.0], {}), args)
     assert (found["kept"], found["expert_return_std"], found["student_return_std"]) == (0.5, 3, 2)
     assert fac.return_kept(3, 0) is fac.return_kept(3, -1) is None  # nothing to keep
@@ -734,7 +758,7 @@ def test_models_plan_with_the_discount_they_were_trained_with(tmp_path, files, c
             return
         for command in (arguments, *evaluations, [*evaluations[0], "--discount", "0.5"]):
             assert fac.main([str(a) for a in command]) == 0
-    assert seen == [0.9, 0.9, 0.9, 0.9, 0.5] and evaluate is fac.evaluate
+    assert seen == [0.9] * 5 + [0.5] and evaluate is fac.evaluate  # one the policy's, alone
 
 
 def test_recorded_returns_stand_for_the_expert_in_distill(tmp_path, files, no_plots, monkeypatch,
@@ -743,11 +767,11 @@ def test_recorded_returns_stand_for_the_expert_in_distill(tmp_path, files, no_pl
     expert = tmp_path / "expert.npz"
     write_expert(expert)
     done = run("evaluate", "--model", expert, "--task", "reacher-hard", "--episodes", "2",
-               "--workers", "1", "--record", "--json", *BUDGET, cwd=tmp_path)
+               "--workers", "1", "--record", "--json", cwd=tmp_path)
     measured = last_json(done)
     ((key, (returns, versions)),) = fac.read_records(expert).items()
     assert returns == measured["returns"] and versions == fac.software()
-    assert "evaluation seed 0" in key and "samples=16" in key
+    assert "evaluation seed 0" in key and "samples=128" in key
 
     arguments = distill_arguments(files, "--expert", expert, "--num-agents", "1", "--out", "out")
     done = succeeded(run(*arguments, "--workers", "0", cwd=tmp_path, env=no_plots))
@@ -780,7 +804,8 @@ def test_recorded_returns_stand_for_the_expert_in_distill(tmp_path, files, no_pl
     assert fac.main([str(a) for a in (*arguments, "--evaluate-expert", "--json")]) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert result["expert_recorded"] is False and result["expert_returns"] == [123.0]
-    assert labels == ["evaluating the student", "evaluating the expert"]
+    assert labels == ["evaluating the student", "evaluating the expert",
+                      "evaluating its policy alone"]
 
 
 def test_expert_and_student_plan_over_the_horizon_they_were_made_for(tmp_path, files, monkeypatch,
@@ -799,7 +824,7 @@ def test_expert_and_student_plan_over_the_horizon_they_were_made_for(tmp_path, f
     assert timed[:2] == [3, 2]
     evaluation = ["evaluate", "--model", str(tmp_path / "student.npz")]
     assert fac.main(evaluation) == fac.main([*evaluation, "--horizon", "0"]) == 0
-    assert seen == [2, 3, 2, 0]
+    assert seen == [2, 3, 3, 2, 0]  # student, expert, its policy; evaluate twice
 
 
 def test_a_terminal_without_plus_minus_gets_its_table(tmp_path, files):
@@ -884,8 +909,8 @@ def test_the_readme_distils_an_expert_of_one_s_own(tmp_path, monkeypatch):
         step = staticmethod(lambda action: (np.zeros(24), float(action[0])))
 
     for words, few in (("dim_obs=4, dim_action=2", "dim_obs=24, dim_action=6"), ("1020", "1001"),
-                       ("DistillConfig()", "DistillConfig(horizon=2, steps=4, own_episodes=1)"),
-                       ("PlannerConfig()", "PlannerConfig(samples=4, iterations=1)")):
+                       ("DistillConfig()", "DistillConfig(horizon=2, steps=4, expert_episodes=1)"),
+                       ("**fac.STUDENT_PLANNING", "prior='policy', samples=4, iterations=1")):
         assert words in distil
         distil = distil.replace(words, few)
     _, arrays = fac.read_npz("mine/replay.npz", ("replay",))
@@ -898,4 +923,7 @@ def test_the_readme_distils_an_expert_of_one_s_own(tmp_path, monkeypatch):
                                   weights["_pi.0.bias"])
     student, header = fac.load_model("mine/student.npz")
     assert (student.config.num_agents, student.config.dim_action) == (6, 6)
-    assert fac.made_for(header, "student.npz") == {"discount": 0.99, "horizon": 2}
+    planning = fac.made_for(header, "student.npz")
+    assert planning.pop("max_std") in fac.WIDTHS and planning == {
+        "discount": 0.99, "horizon": 2, "prior": "policy", "samples": 4, "iterations": 1,
+        "output": "sampled"}

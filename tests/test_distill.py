@@ -7,7 +7,8 @@ import pytest
 import fac_tdmpc_ref as fac
 from test_planning import random_model
 
-CONFIG = fac.DistillConfig(steps=300, batch_size=16, warmup=20, lr=3e-3, horizon=3, own_episodes=0)
+CONFIG = fac.DistillConfig(steps=300, batch_size=16, warmup=20, lr=3e-3, horizon=3,
+                           expert_episodes=0, noise_std=0.5)
 
 
 def write_replay(path, task="", mark=None):
@@ -158,7 +159,7 @@ def go_on(distiller, steps):
     distiller.close()
 
 
-def own_episodes(*values):
+def played(*values):
     """Episodes of one observation each and actions of -0.9, as `Distiller.add` takes them."""
     return (np.zeros((len(values), fac.EPISODE_STEPS, 8)) + np.array(values)[:, None, None],
             np.full((len(values), fac.EPISODE_STEPS, 3), -0.9))
@@ -169,7 +170,7 @@ def test_a_resumed_run_ends_as_an_uninterrupted_one(replay, monkeypatch, pool, o
     monkeypatch.setattr(fac, "POOL", pool)  # a pool of 64 lasts 16 steps
     whole, _ = distilled(replay, CONFIG, 5)
     if own:
-        whole.add(*own_episodes(0.5, -0.5))
+        whole.add(*played(0.5, -0.5))
     go_on(whole, 7)
     second, _ = distilled(replay, CONFIG, 3)  # somewhere else, then put back
     second.load({k: np.copy(v) for k, v in whole.state().items()})
@@ -180,13 +181,13 @@ def test_a_resumed_run_ends_as_an_uninterrupted_one(replay, monkeypatch, pool, o
     assert np.array_equal(whole.optimizer.vector, without.optimizer.vector) != own
 
 
-def test_a_share_of_the_states_is_the_students_own(replay):
-    """With what it did and what the policy would do."""
-    config = fac.dataclasses.replace(CONFIG, encoder_input="observation", own_share=0.25,
+def test_a_share_of_the_states_is_from_what_was_played(replay):
+    """With what was done there, or what the policy would do."""
+    config = fac.dataclasses.replace(CONFIG, encoder_input="observation", played_share=0.25,
                                      noise_std=1e-3, batch_size=400)
     with fresh(replay, config) as distiller:
-        distiller.add(*own_episodes(7, 8))
-        distiller.add(*own_episodes(9))
+        distiller.add(*played(7, 8))
+        distiller.add(*played(9))
         (features,), actions, _ = distiller.batch(0)
         own = features[0] >= 7
         assert 0.18 < own.mean() < 0.32 and set(features[0, own]) == {7, 8, 9}
@@ -195,20 +196,14 @@ def test_a_share_of_the_states_is_the_students_own(replay):
         for _ in actions:  # what the expert's policy does there
             expected.append(expert.policy(z)[0])
             z = expert.next(z, expected[-1][None])
-        played, theirs = (np.abs(actions[:, :, own] - base).max((0, 1)) < 0.01
-                          for base in (-0.9, np.array(expected)[..., None]))
-        assert (played ^ theirs).all() and 0.4 < played.mean() < 0.6
-    with fresh(replay, fac.dataclasses.replace(config, own_episodes=2)) as distiller:
-        with pytest.raises(fac.UserError, match="own_episodes=0"):
+        done, theirs = (np.abs(actions[:, :, own] - base).max((0, 1, 3)) < 0.01
+                        for base in (-0.9, np.array(expected)[..., None]))
+        assert (done ^ theirs).all() and 0.3 < done.mean() < 0.7
+    with fresh(replay, fac.dataclasses.replace(config, expert_episodes=2)) as distiller:
+        with pytest.raises(fac.UserError, match="expert_episodes=0"):
             next(distiller.run())
-    for quarters, expected in ((0, 0), (1, 2), (2, 4), (3, 6)):
-        with fresh(replay, fac.dataclasses.replace(config, own_episodes=2)) as distiller:
-            distiller.optimizer.t = quarters * 75
-            asked = []
-            run = distiller.run(lambda first, count, asked=asked: asked.append((first, count))
-                                or own_episodes(*range(count)))
-            next(run), next(run)
-            assert asked == [(0, expected)] * bool(expected)
+        distiller.add(*played(1, 2))
+        next(distiller.run())
 
 
 def ramp():
@@ -217,58 +212,36 @@ def ramp():
     return np.repeat(t, 8, 1), np.repeat(t[:-1] / 512, 3, 1)
 
 
-def test_a_student_s_own_actions_begin_where_their_state_is(replay):
+def test_played_actions_begin_where_their_state_is(replay):
     obs, action = ramp()
-    config = fac.dataclasses.replace(CONFIG, encoder_input="observation", own_share=1.0,
+    config = fac.dataclasses.replace(CONFIG, encoder_input="observation", played_share=1.0,
                                      noise_std=1e-6)
     with fresh(replay, config) as distiller:
         distiller.add(obs[None, :-1], action[None])
         (features,), actions, _ = distiller.draw(0, 0, 64)
     expected = (features[0] + np.arange(4)[:, None]) / 512
-    played = (np.abs(actions[:, 0] - expected[..., None]) < 1e-4).all(0)
-    assert 0.35 < played.mean() < 0.65  # the others' are the policy's [D8]
+    done = (np.abs(actions[:, 0] - expected[..., None]) < 1e-4).all((0, 2))
+    assert 0.3 < done.mean() < 0.7  # the others' are the policy's [D8]
 
 
-def test_own_states_are_drawn_from_all_of_all_own_episodes(replay):
-    (obs, action), count = ramp(), 2000
-    config = fac.dataclasses.replace(CONFIG, encoder_input="observation", own_share=1.0,
-                                     noise_samples=2)
-    with fresh(replay, config) as distiller:
-        distiller.add(np.stack([obs[:-1], -obs[:-1]]), np.stack([action, action]))
-        (features,), _, _ = distiller.draw(0, 0, count)
-    drawn, _ = np.histogram(features[0], 8, (-496, 496))  # a quarter of an episode each
-    assert drawn.sum() == count and drawn.min() > 0.7 * count / 8 and drawn.max() < 1.3 * count / 8
-
-
-def test_a_student_plays_no_own_episode_twice(replay, tmp_path, monkeypatch):
+def test_the_expert_s_policy_plays_first_with_noise_and_once(replay, tmp_path, monkeypatch):
+    """A run that goes on learns from the same episodes, and plays none."""
     seen = []
-    monkeypatch.setattr(fac, "play", lambda model, task, planning, seeds, *_: (
-        seen.extend(seeds), own_episodes(*range(len(seeds))))[1])
+
+    def play(model, task, planning, seeds, workers, label, environment, noise):
+        seen.append((model, planning.prior, planning.iterations, seeds, noise))
+        return played(*range(len(seeds)))
+
+    monkeypatch.setattr(fac, "play", play)
     monkeypatch.setattr(fac, "rank_correlation", lambda *_: (np.zeros(4), np.zeros(4)))
-    config = fac.dataclasses.replace(CONFIG, steps=8, batch_size=4, own_episodes=2)
-    with fresh(replay, config) as distiller:
-        fac.train_student(distiller, tmp_path, {"task": "x"}, fac.PlannerConfig(), 0)
-    assert seen == fac.training_seeds(0, "own episode", 0, 6) and len(set(seen)) == 6
-
-
-def test_a_row_of_the_curve_is_of_the_steps_since_the_last(replay, tmp_path, monkeypatch):
-    found, rates = [], []
-    monkeypatch.setattr(fac, "rank_correlation", lambda *_: (np.arange(4), np.arange(4, 8)))
-    config = fac.dataclasses.replace(CONFIG, steps=24, batch_size=4, warmup=9)
-    with fresh(replay, config) as distiller:
-        step = distiller.step
-
-        def watched():
-            rates.append(fac.learning_rate(config, distiller.t))
-            found.append(step())
-            return found[-1]
-
-        monkeypatch.setattr(distiller, "step", watched)
-        curve, _ = fac.train_student(distiller, tmp_path, {"task": "x"}, fac.PlannerConfig(), 0)
-    assert [row[0] for row in curve] == list(range(3, 25, 3)) and len(found) == 24
-    for row, first in zip(curve, range(0, 24, 3)):
-        np.testing.assert_allclose(row[2:5], np.mean(found[first:first + 3], 0))
-        assert row[5:] == [rates[first + 2], 0, 3, 7]
+    config = fac.dataclasses.replace(CONFIG, steps=8, batch_size=4, expert_episodes=3)
+    for _ in range(2):
+        with fresh(replay, config) as distiller:
+            fac.train_student(distiller, tmp_path, {"task": "x"}, fac.PlannerConfig(), 0)
+            assert len(distiller.played) == 3
+    seeds = fac.training_seeds(0, "expert episode", 0, 3)
+    assert len(set(seeds)) == 3 and len(seen) == 1
+    assert seen[0][1:] == ("policy", 0, seeds, 0.6) and seen[0][0].has_policy
 
 
 @pytest.mark.parametrize("clip", [True, False])
@@ -278,13 +251,14 @@ def test_perturbed_actions_are_clipped_where_they_should_be(replay, clip):
 
 
 def test_perturbations_are_of_their_deviation_and_each_its_own(replay):
-    config = fac.dataclasses.replace(CONFIG, noise_std=0.3, noise_samples=50, clip_actions=False)
+    config = fac.dataclasses.replace(CONFIG, noise_std=0.3, noise_samples=51, clip_actions=False)
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1, 1, (4, 3, 20, 1)).astype(np.float32)
     with fresh(replay, config) as distiller:
         _, perturbed, _ = fac.perturbed_batch(distiller.expert, distiller.student,
                                               np.zeros((8, 20), np.float32), actions, config, rng)
-    noise = perturbed - actions
+    assert np.array_equal(perturbed[..., :1], actions)
+    noise = (perturbed - actions)[..., 1:]
     assert noise.shape == (4, 3, 20, 50)
     assert abs(noise.std() / 0.3 - 1) < 0.03 and abs(noise.mean()) < 0.02
     for axis in range(4):  # of step, dimension, state and copy
@@ -314,13 +288,39 @@ def test_each_state_of_a_pool_is_learned_from_as_often_as_it_says(replay, monkey
     assert not pools[0] & pools[1]
 
 
-def test_the_batch_s_predictions_are_the_experts_for_its_actions(replay):
-    config = fac.dataclasses.replace(CONFIG, encoder_input="observation")
+@pytest.mark.parametrize("targets", ["joint", "credit"])
+def test_the_batch_s_predictions_are_the_experts_for_its_actions(replay, targets):
+    """Or, of each agent, its part of how they differ from those for the actions without noise."""
+    config = fac.dataclasses.replace(CONFIG, encoder_input="observation", targets=targets)
     with fresh(replay, config) as distiller:
-        (obs,), actions, targets = distiller.batch(3)
+        (obs,), actions, found = distiller.batch(3)
     expected = fac.predict(distiller.expert, distiller.expert.encode(obs), actions)
-    for found, target in zip(expected, targets):
-        np.testing.assert_allclose(found, target, rtol=1e-4, atol=1e-5)
+    if targets == "credit":
+        assert all(parts.shape[:2] == (3, 4) for parts in found)
+        reward, q1, q2 = expected
+        expected = [y - y[..., :1] for y in (reward, (q1 + q2) / 2, (q1 + q2) / 2)]
+        found = [parts.sum(0) for parts in found]
+    for output, target in zip(expected, found):
+        np.testing.assert_allclose(output, target, rtol=1e-4, atol=2e-5)
+
+
+def test_with_credit_a_state_s_first_copy_is_not_perturbed(replay):
+    """Half of the states' copies are around what was done, half around what the policy would do."""
+    config = fac.dataclasses.replace(CONFIG, encoder_input="observation", targets="credit")
+    with fresh(replay, config) as distiller:
+        (obs,), actions, _ = distiller.draw(0, 0, 200)
+        expert = distiller.expert
+        z = expert.encode(obs)
+        policy = fac.policy_rollout(expert, z, [np.float32(0)] * 4)[:, 0]
+        _, joint, _ = fac.perturbed_batch(expert, distiller.student, obs, policy[..., None],
+                                          fac.dataclasses.replace(config, targets="joint"),
+                                          np.random.default_rng(0))
+    theirs = (np.abs(actions[..., 0] - policy) < 1e-5).all((0, 1))
+    assert 0.4 < theirs.mean() < 0.6
+    done = distiller.replay.action.astype(np.float32)
+    assert all((np.abs(done - a).max(1) < 1e-3).any() for a in actions[0, :, ~theirs, 0][:20])
+    assert (actions[..., 1] != actions[..., 0]).mean() > 0.8  # where noise is not clipped away
+    assert (joint[..., 0] != policy).mean() > 0.8
 
 
 @pytest.mark.parametrize("batch", [2, 5, 16])
@@ -336,6 +336,51 @@ def test_a_step_in_halves_is_the_step_of_the_whole(replay, batch):
         found = distiller.step()
     np.testing.assert_allclose(found, (loss, *means), rtol=1e-5)
     np.testing.assert_allclose(seen[0], gradient, rtol=1e-3, atol=1e-5 * np.abs(gradient).max())
+
+
+def test_what_plans_gain_is_told_by_the_expert_and_promised_by_the_model(replay):
+    config = fac.PlannerConfig(prior="policy", max_std=0.3, samples=64, iterations=3, pi_trajs=0)
+    obs = replay.observation[:16].T.astype(np.float32)
+    with fresh(replay, CONFIG) as distiller:
+        expert, student = distiller.expert, distiller.student
+    gain, promise = fac.plan_gains(expert, expert, config, obs)
+    assert gain.shape == (16,) and np.array_equal(gain, promise)  # its own G is the expert's
+    assert gain.mean() > 0 and (gain > 0).mean() > 0.8
+    still = fac.dataclasses.replace(config, iterations=0)
+    assert not np.any(fac.plan_gains(expert, expert, still, obs))
+    rng, z = np.random.default_rng(0), expert.encode(obs)
+    for key, value in student.params.items():  # one that knows nothing
+        if not key.startswith("_expert"):
+            value[:] = 0.3 * rng.standard_normal(value.shape)
+    lost, promised = fac.plan_gains(expert, student, config, obs)
+    assert promised.mean() > 0 and lost.mean() < gain.mean() / 2
+    assert not np.array_equal(lost, fac.plan_gains(expert, student, config, obs, 1)[0])
+    still = fac.dataclasses.replace(still, prior="none")  # whose plan is to do nothing
+    policy = fac.policy_rollout(expert, z, [np.float32(0)] * 4)[:, 0]
+    both = np.stack([np.zeros_like(policy), policy], -1)
+    G = fac.horizon_returns(*fac.predict(expert, z, both), config.discount)[-1]
+    np.testing.assert_allclose(fac.plan_gains(expert, student, still, obs)[0], G[:, 0] - G[:, 1],
+                               rtol=1e-4, atol=1e-5)
+
+
+def test_a_search_is_as_wide_as_gains_most_less_a_standard_error(replay, monkeypatch):
+    means = dict(zip(fac.WIDTHS, (0.1, 0.3, 0.35, 0.2, 0.1, 0.0)))
+    seen = []
+
+    def gains(expert, model, config, obs, seed):
+        seen.append((model, obs.tobytes()))
+        return (means[config.max_std] + (config.max_std == 0.15) * np.array([2.0, -2.0] * 8),
+                np.full(16, config.max_std))
+
+    monkeypatch.setattr(fac, "plan_gains", gains)
+    with fresh(replay, CONFIG) as distiller:
+        width, rows = fac.search_width(distiller, fac.PlannerConfig(prior="policy"), 16)
+        assert {model for model, _ in seen} == {distiller.student}
+        held = replay.observation[distiller.held_out_starts].astype(np.float32)
+    assert width == 0.1 and [row[0] for row in rows] == list(fac.WIDTHS)
+    assert rows[2][1:] == pytest.approx([0.35, 2 * np.sqrt(16 / 15) / 4, 0.15])
+    ((_, obs),) = {(None, obs) for _, obs in seen}  # all in the same states, which were held out
+    assert all((held == o).all(1).any() for o in np.frombuffer(obs, np.float32).reshape(8, -1).T)
 
 
 def test_a_step_learns_at_its_rate_and_clips_its_gradient(replay, monkeypatch):
@@ -376,7 +421,8 @@ def test_hidden_layers_have_50_units_or_more(tmp_path):
         "observation": rng.standard_normal((60, 8)).astype(np.float16),
         "action": rng.uniform(-1, 1, (60, 12)).astype(np.float16),
         "continues": np.arange(1, 61) % 10 != 0})
-    expert, config = random_model(1, 12), fac.dataclasses.replace(CONFIG, held_out=0.3)
+    expert = random_model(1, 12, policy=True)
+    config = fac.dataclasses.replace(CONFIG, held_out=0.3)
     for n, width in ((12, 50), (6, 85)):  # 512 // 12 is 42
         with contextlib.closing(fac.Distiller(expert, fac.Replay(tmp_path / "replay.npz"), config,
                                               n)) as distiller:
@@ -386,7 +432,7 @@ def test_hidden_layers_have_50_units_or_more(tmp_path):
 def test_what_diverges_stops(replay):
     with fresh(replay, CONFIG) as distiller:
         episode = np.full((1, fac.EPISODE_STEPS, 8), 1e6), np.zeros((1, fac.EPISODE_STEPS, 3))
-        with pytest.raises(fac.UserError, match="own episodes: not finite"):
+        with pytest.raises(fac.UserError, match="played episodes: not finite"):
             distiller.add(*episode)
         distiller.optimizer.vector[:] = np.nan
         with pytest.raises(fac.UserError, match="after update 1 the loss is no longer finite"):
@@ -396,7 +442,7 @@ def test_what_diverges_stops(replay):
 def test_other_numbers_of_agents_are_refused(replay):
     for n in (2, 0, 4):
         with pytest.raises(fac.UserError, match=r"one of \[1, 3\]"):
-            fac.Distiller(random_model(n=1), replay, CONFIG, n)
+            fac.Distiller(random_model(n=1, policy=True), replay, CONFIG, n)
 
 
 def test_sizes_of_a_student():
@@ -409,7 +455,8 @@ def test_sizes_of_a_student():
 
 @pytest.mark.parametrize("name, settings", [
     ("noise_samples", {"noise_samples": 10 ** 8}), ("batch_size", {"batch_size": 10 ** 8}),
-    ("horizon", {"horizon": 28, "noise_samples": 10}), ("own_episodes", {"own_episodes": 10 ** 7}),
+    ("horizon", {"horizon": 28, "noise_samples": 10}),
+    ("expert_episodes", {"expert_episodes": 10 ** 7}),
     ("mlp_dim", {})])
 def test_memory_that_is_not_there_is_refused_before_it_is_taken(replay, monkeypatch, name,
                                                                 settings):
@@ -446,7 +493,7 @@ def test_what_learns_keeps_its_memory(replay):
 def test_learning_rate_schedule():
     rates = [fac.learning_rate(CONFIG, t) for t in range(CONFIG.steps)]
     assert rates[0] < rates[10] < rates[19] <= CONFIG.lr and rates[-1] < 0.001 * CONFIG.lr
-    constant = fac.dataclasses.replace(CONFIG, **fac.paper_preset(fac.DistillConfig))
+    constant = fac.dataclasses.replace(CONFIG, **fac.preset_values(fac.DistillConfig, "paper"))
     assert {fac.learning_rate(constant, t) for t in range(50)} == {1e-4}
 
 
@@ -488,8 +535,9 @@ def test_odd_settings_learn_all_the_same(replay, odd, n):
 
 @pytest.mark.parametrize("encoder_input", ["latent", "observation"])
 def test_sizes_of_one_s_own_leave_what_the_encoder_reads(tmp_path, replay, encoder_input):
-    expert, config = random_model(n=1), fac.dataclasses.replace(CONFIG, encoder_input=encoder_input)
-    sizes = fac.student_config(expert.config, 3, encoder_input)
+    expert = random_model(n=1, policy=True)
+    config = fac.dataclasses.replace(CONFIG, encoder_input=encoder_input)
+    sizes = fac.student_config(expert.config, 3, encoder_input, True)
     with contextlib.closing(fac.Distiller(expert, replay, config, mlp_dim=7)) as distiller:
         assert distiller.student.config == fac.dataclasses.replace(sizes, mlp_dim=7)
         distiller.step()
@@ -500,6 +548,6 @@ def test_sizes_of_one_s_own_leave_what_the_encoder_reads(tmp_path, replay, encod
 
 def test_an_expert_without_a_policy_says_so(replay):
     expert = random_model(n=1)
-    with pytest.raises(fac.UserError, match="no policy.*--own-episodes 0"):
-        fac.Distiller(expert, replay, fac.dataclasses.replace(CONFIG, own_episodes=2))
-    fac.Distiller(expert, replay, CONFIG).close()
+    with pytest.raises(fac.UserError, match="no policy.*--policy-share 0 --expert-episodes 0"):
+        fac.Distiller(expert, replay, CONFIG)
+    fac.Distiller(expert, replay, fac.dataclasses.replace(CONFIG, policy_share=0.0)).close()

@@ -139,7 +139,7 @@ def test_help_teaches():
 
 SMALL = ["--tasks", "cheetah-run", "--seeds", "0", "--steps", "4", "--episodes", "1", "--samples",
          "8", "--iterations", "1", "--out", "sweep.csv"]
-SET = ["own-episodes=0", "batch-size=2"]
+SET = ["expert-episodes=0", "batch-size=2"]
 
 
 def rows_of(path):
@@ -340,7 +340,8 @@ def test_bad_runs_are_refused(tmp_path, flags, parts):
 def test_report_names_the_file_that_holds_another_figure_s_runs(tmp_path, figure):
     pytest.importorskip("matplotlib")
     rows = [{**experiments.make_run("reacher-hard", 0, case, episodes=1), "step": 5,
-             "return_mean": 1.0, "minutes": 1.0} for case in ("a", "b", "c")]
+             "return_mean": 1.0, "minutes": 1.0, "versions": experiments.versions()}
+            for case in ("a", "b", "c")]
     experiments.append_rows(tmp_path / f"{figure}.csv", rows)
     refused(run("report", "--results", ".", "--figures", ".", cwd=tmp_path), f"{figure}.csv: not "
             f"{figure}'s rows")
@@ -368,7 +369,7 @@ def test_every_method_of_figure_4_learns_and_plans():
         kind = baselines.distiller_of(case)
         expert, _ = fac.load_model(fac.data_file("cheetah-run", "expert.npz"))
         replay = fac.Replay(fac.data_file("cheetah-run", "replay.npz"))
-        config = fac.DistillConfig(steps=2, batch_size=2, own_episodes=0)
+        config = fac.DistillConfig(steps=2, batch_size=2, expert_episodes=0)
         distiller = kind(expert, replay, config, settings.get("num_agents"), 0)
         assert len(list(distiller.run())) == 2
         distiller.close()
@@ -376,7 +377,7 @@ def test_every_method_of_figure_4_learns_and_plans():
                             if k.startswith(("_dynamics", "_reward", "_Q")))
         rows = list(experiments.distil("cheetah-run", 0, case, {
             **settings, "steps": 4, "evaluations": 2, "episodes": 1, "samples": 4,
-            "iterations": 1, "own_episodes": 0, "batch_size": 2}))
+            "iterations": 1, "expert_episodes": 0, "batch_size": 2}))
         assert [row["step"] for row in rows] == [2, 4] and rows[-1]["return_mean"] >= 0
     assert 0.02 < weights["10% TD-MPC"] / weights["100% TD-MPC"] < 0.04
 
@@ -393,12 +394,11 @@ def test_a_run_is_distilled_as_it_says(monkeypatch):
     monkeypatch.setattr(experiments, "distiller_of", lambda case: lambda *args: (
         made.append(args[3:]), fac.Distiller(*args))[1])
     (row,) = experiments.distil("cheetah-run", 5, "x", {
-        "num_agents": 3, "steps": 4, "batch_size": 2, "horizon": 2, "own_episodes": 1,
+        "num_agents": 3, "steps": 4, "batch_size": 2, "horizon": 2, "expert_episodes": 3,
         "samples": 7, "iterations": 1})
-    *own, (*last, evaluated) = seen
+    (*_, played), (*last, evaluated) = seen
     assert made == [(3, 5)] and last == [3, 2, 7] and evaluated == fac.episode_seeds(0, 10)
-    assert sum((seeds for *_, seeds in own), []) == fac.training_seeds(5, "own episode", 0, 3)
-    assert {samples for _, _, samples, _ in own} == {64} == {fac.OWN_BUDGET["samples"]}
+    assert played == fac.training_seeds(5, "expert episode", 0, 3)
     assert (row["rank_q"], row["rank_return"]) == (0, 6)
 
 
@@ -437,7 +437,7 @@ def loss_inputs(dtype=np.float64):
         value += 0.1 * rng.standard_normal(value.shape)
     targets = [rng.standard_normal((3, 4, 3)) for _ in range(3)]
     return (student, rng.standard_normal((1, 4, 4)), rng.uniform(-1, 1, (3, 2, 4, 3)),
-            [*targets, rng.standard_normal((3, 4, 3, 4))])
+            [*targets, rng.standard_normal((4, 3, 4, 3))])
 
 
 @pytest.mark.parametrize("kind", [baselines.MSEDistiller, baselines.ConsistentDistiller])
@@ -448,7 +448,7 @@ def test_gradients_of_the_other_losses(kind, monkeypatch):
     grads = {k: np.zeros_like(v) for k, v in student.params.items() if k[:7] != "_expert"}
     kind.loss(student, features, actions, targets, config, grads)
     encode = student.encode_features  # the goals, of 3 * 4 * 3 columns, are held fixed
-    goal = targets[-1].reshape(1, -1, 4).swapaxes(1, 2) if len(targets) == 4 else None
+    goal = targets[-1].reshape(1, 4, -1) if len(targets) == 4 else None
     fixed = goal is not None and encode(goal)
     monkeypatch.setattr(student, "encode_features", lambda x, tape=None: fixed
                         if x.shape[-1] == 36 else encode(x, tape))
@@ -462,13 +462,13 @@ def test_consistency_rolls_out_once(monkeypatch):
     """Equation 4 and the consistency are of one rollout and walk back together."""
     student, features, actions, targets = loss_inputs()
     config, calls = fac.DistillConfig(horizon=2), []
-    for name in ("unroll", "run_heads", "predict_backward"):
+    for name in ("unroll", "run_heads", "heads_backward", "unroll_backward"):
         real = getattr(fac, name)
         monkeypatch.setattr(fac, name, lambda *args, real=real, name=name: (
             calls.append(name), real(*args))[1])
     grads = {k: np.zeros_like(v) for k, v in student.params.items() if k[:7] != "_expert"}
     baselines.consistency_loss(student, features, actions, targets, config, grads)
-    assert calls == ["unroll", "run_heads", "predict_backward"]
+    assert calls == ["unroll", "run_heads", "heads_backward", "unroll_backward"]
 
 
 def test_a_figure12_run_counts_as_finished_by_its_last_row_alone(tmp_path, monkeypatch):
@@ -499,7 +499,7 @@ def test_consistency_vanishes_where_the_student_follows_the_expert():
     for h in range(3):
         a = actions[h].reshape(2, 1, 12)
         z = student.next(z, a)
-        goal = student.encode_features(targets[3][h].reshape(1, 12, 4).swapaxes(1, 2))
+        goal = student.encode_features(targets[3][:, h].reshape(1, 4, 12))
         expected += 2.0 * 0.5 ** h * ((z - goal) ** 2).mean()
     assert np.isclose(found - base, expected)
 
@@ -566,18 +566,12 @@ def test_the_action_vae_finds_a_plane():
     assert ((back - x[4:]) ** 2).mean() < 0.05 * x[4:].var()
 
 
-def test_tap_learns_from_the_robot_s_actions_of_its_own_episodes():
+def test_tap_s_targets_are_for_what_the_robot_would_do():
     expert, _ = fac.load_model(fac.data_file("reacher-hard", "expert.npz"))
     replay, rng = fac.Replay(fac.data_file("reacher-hard", "replay.npz")), np.random.default_rng(0)
     config = fac.DistillConfig(steps=8, batch_size=8)
     distiller = baselines.TapDistiller(expert, replay, config, vae_steps=10)
     with contextlib.closing(distiller):
-        obs = rng.uniform(-1, 1, (2, fac.EPISODE_STEPS, 8))
-        u = rng.uniform(-1, 1, (2, fac.EPISODE_STEPS, 2)).astype(np.float32)
-        distiller.add(obs, u)
-        s = expert.encode(obs[1, 7][:, None])[0]
-        expected = distiller.vae.decode(s, u[1, 7][:, None])[:, 0]
-        assert np.allclose(distiller.own[1, 7, 8:], expected, atol=1e-3)
         obs, actions = replay.sequences(distiller.train_starts[:4], 4)
         spread = []
         for deviation in (1e-7, 0.5):  # targets are for what the robot would do
@@ -707,7 +701,7 @@ def test_a_run_made_with_other_defaults_is_another_run(monkeypatch):
     assert expected in experiments.attempt(experiments.distil, seen[0], os.getpid())[-1]["error"]
     settings = {"decisions": 4000, "episodes": 1}
     before = experiments.made_from("walker-walk", {"data": 0, **settings})
-    monkeypatch.setitem(train_expert.FOLLOWING_DEFAULTS, "own_share", 0.5)
+    monkeypatch.setitem(train_expert.FOLLOWING_DEFAULTS, "played_share", 0.25)
     run = experiments.make_run("walker-walk", 0, "online", data=before, **settings)
     row = experiments.attempt(experiments.follow, run, os.getpid())[-1]
     assert "a default has changed" in row["error"]
@@ -718,10 +712,10 @@ def test_departures_are_those_that_the_settings_name(monkeypatch):
     monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: seen.extend(runs))
     assert experiments.main(["departures", "--tasks", "walker-run", "--seeds", "3"]) == 0
     found = {run["case"]: json.loads(run["settings"]) for run in seen}
-    assert set(found) == {"default", "D2", "D3", "D7", "D8"}
+    assert set(found) == {"default", "D2", "D3", "D7", "D8", "D9"}
     own = set(found["default"])
     assert {k: v for k, v in found["D7"].items() if k not in own} == {"clip_actions": False}
-    assert found["D2"]["kl"] == "reverse" and found["D8"]["own_episodes"] == 0
+    assert found["D2"]["kl"] == "reverse" and found["D8"]["expert_episodes"] == 0
 
 
 def test_the_cases_of_figure_5_learn_what_they_say():
@@ -731,6 +725,7 @@ def test_the_cases_of_figure_5_learn_what_they_say():
     assert kinds.pop("consistency") is baselines.ConsistentDistiller
     assert set(kinds.values()) == {fac.Distiller} and len(kinds) == 6
     assert {k: v for k, v in experiments.FIGURE5_CASES.items() if v} == {
+        "MSE": {"targets": "joint"},  # values, not what changes them
         **{f"noise {x}": {"noise_std": x} for x in (0.1, 1.0, 2.0)},
         **{f"T_s {x}": {"temperature_student": x} for x in (0.1, 2.0)}}
 
@@ -741,10 +736,10 @@ def test_goals_of_the_consistency_loss_are_the_expert_s_next_latents(replay):
                                                           test_distill.CONFIG)) as distiller:
         z, actions, targets = distiller.draw(0, 0, 4)
     z = np.repeat(z, actions.shape[3], 2)
-    assert len(targets[-1]) == len(actions) == 4
-    for a, after in zip(actions, targets[-1]):
+    assert targets[-1].shape == (6, 4, *actions.shape[2:]) and len(actions) == 4
+    for a, after in zip(actions, targets[-1].swapaxes(0, 1)):
         z = expert.next(z, a.reshape(1, 3, -1))
-        np.testing.assert_allclose(after.reshape(-1, 6).T, z[0], rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(after.reshape(6, -1), z[0], rtol=1e-4, atol=1e-5)
 
 
 def test_mse_is_a_mean_over_perturbations():
@@ -1035,7 +1030,10 @@ def test_the_table_of_students_has_a_line_for_each_budget_and_columns_for_each_p
 def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkeypatch):
     steps, step, rows = [], fac.Distiller.step, []
     monkeypatch.setattr(fac.Distiller, "step", lambda self: (steps.append(1), step(self))[1])
-    monkeypatch.setattr(fac, "rank_correlation", lambda *_: (np.full(4, 0.5), np.full(4, 0.25)))
+    monkeypatch.setattr(fac, "rank_results", lambda *_: {
+        "rank_correlation": 0.5, "rank_correlation_episodes": 1, **{
+            f"rank_correlation_{key}": [0.25] * 4
+            for key in ("by_step", "returns", "returns_training", "returns_se")}})
     monkeypatch.setattr(fac, "time_both", lambda *_: {
         "plan_ms_expert": 1.0, "plan_ms_student_in_process": 1.0, "plan_ms_student": 1.0,
         "plan_workers": 0})
@@ -1053,11 +1051,14 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
     model, header = fac.load_model(tmp_path / "reacher-easy-3" / "student.npz")
     assert (header["seed"], model.config.num_agents, header["distill"]["steps"]) == (3, 3, 1)
     expert, _ = fac.load_model(fac.data_file("reacher-easy", "expert.npz"))
-    planning = fac.PlannerConfig(samples=4, iterations=1)
+    own = fac.PlannerConfig()
     for row in rows[2:]:
-        seeds = fac.episode_seeds(int(row["evaluation_seed"]), 1)
-        expected = {"policy_returns": students.policy_returns(expert, "reacher-easy", seeds)}
-        for key, who in (("returns", model), ("expert_returns", expert)):
+        seeds, expected = fac.episode_seeds(int(row["evaluation_seed"]), 1), {}
+        for key, who, planning in (
+                ("returns", model, fac.PlannerConfig(**fac.made_for(header, "student.npz"))),
+                ("expert_returns", expert, own), ("policy_returns", expert,
+                                                  fac.dataclasses.replace(own, prior="policy",
+                                                                          iterations=0))):
             expected[key] = fac.play(who, "reacher-easy", planning, seeds, 0)[2].sum(1)
         for key, returns in expected.items():
             np.testing.assert_allclose(json.loads(row[key]), returns, atol=1e-3)
@@ -1077,32 +1078,10 @@ def test_a_preset_s_students_have_its_budget_and_a_folder_of_their_own(monkeypat
         assert experiments.main(["students", "--tasks", "walker-run", "--seeds", "0", *flags]) == 0
     found = [(run["case"], *(json.loads(run["settings"])[k] for k in (
         "steps", "samples", "iterations"))) for run in seen]
-    assert found == [("default", 14000, 128, 4), ("paper", 100000, 512, 6),
+    assert found == [("default", 14000, 32, 3), ("paper", 100000, 512, 6),
                      ("paper", 14000, 128, 4)]
     assert [str(students.folder("runs", "walker-run", 0, preset)) for preset in (
         "default", "paper")] == ["runs/walker-run-0", "runs/walker-run-0-paper"]
-
-
-def test_a_policy_alone_acts_by_what_it_sees(monkeypatch):
-    class Robot:
-        """Rewards the action that the policy takes in what it showed last."""
-
-        def __init__(self, task):
-            self.obs = None
-
-        def reset(self, seed):
-            self.obs = np.full(8, seed / 10, np.float32)
-            return self.obs
-
-        def step(self, action):
-            expected = expert.policy(expert.encode(self.obs[:, None]))[0, :, 0]
-            self.obs = -self.obs
-            return self.obs, float(np.array_equal(action, expected))
-
-    expert = random_model(1, policy=True)
-    monkeypatch.setattr(fac, "Environment", Robot)
-    assert students.policy_returns(expert, "x", [1, 2]) == [fac.EPISODE_STEPS] * 2
-    assert students.policy_returns(random_model(3), "x", [1, 2]) == []
 
 
 def test_returns_of_other_versions_are_said_to_be_old(tmp_path, capsys):
@@ -1165,7 +1144,8 @@ def test_watch_writes_a_moving_picture(tmp_path, name):
 
 @pytest.mark.parametrize("flags, parts", [
     (["--model", "none.npz", "--out", "x.gif"], ["none.npz", "no such file"]),
-    (["--model", "none.npz", "--out", "x.gif", "--decisions", "501"], ["500", "501"]),
+    (["--model", str(fac.data_file("reacher-hard", "expert.npz")), "--out", "x.gif", "--decisions",
+      "501"], ["500", "501"]),
     (["--model", "none.npz", "--out", "x.png"], ["x.png", ".gif", ".mp4"])])
 def test_watch_refuses(tmp_path, flags, parts):
     pytest.importorskip("matplotlib")

@@ -16,7 +16,6 @@ import time
 import tracemalloc
 import warnings
 import zipfile
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -820,8 +819,8 @@ def test_the_share_that_is_advised_holds_out_an_episode(tmp_path, episodes):
 
 def test_an_action_repeat_goes_with_the_files_through_distill_and_evaluate(tmp_path, capsys,
                                                                            monkeypatch):
-    """Episodes, replay, own episodes, evaluation and planner follow it; a replay of another is
-    refused, and so is one that doesn't divide."""
+    """Episodes, replay, the expert's episodes, evaluation and planner follow it; a replay of
+    another is refused, and so is one that doesn't divide."""
     monkeypatch.setattr(fac, "CONTROL_STEPS", 40)  # of 1000
     model, made, played = write_state(tmp_path / "model.pt", weights()), [], []
     environment, play = fac.Environment, fac.play
@@ -839,8 +838,9 @@ def test_an_action_repeat_goes_with_the_files_through_distill_and_evaluate(tmp_p
         assert replay.transitions == 3 * 40 // repeat and replay.header["action_repeat"] == repeat
     assert made == [(2,), (4,)]
     distill = ["distill", "--task", TASK, "--expert", str(tmp_path / "4"), "--steps", "4",
-               "--own-episodes", "1", "--episodes", "1", "--plan-samples", "4", "--batch-size", "2",
-               "--plan-iterations", "1", "--held-out", "0.34", "--workers", "0", "--out",
+               "--expert-episodes", "1", "--episodes", "1", "--plan-samples", "4", "--batch-size",
+               "2", "--policy-share", "0", "--plan-iterations", "1", "--held-out", "0.34",
+               "--workers", "0", "--out",
                str(tmp_path / "run")]
     assert fac.main([*distill, "--replay", str(tmp_path / "2" / "replay.npz")]) == 2
     assert ("replay.npz: header: action_repeat: expected 4, as the expert was made for, found 2"
@@ -849,7 +849,7 @@ def test_an_action_repeat_goes_with_the_files_through_distill_and_evaluate(tmp_p
     assert fac.main(distill) == 0
     assert fac.main(["evaluate", "--model", str(tmp_path / "run" / "student.npz"), "--workers", "0",
                      "--episodes", "1", "--samples", "4"]) == 0
-    assert set(made) == {(), (4,)} and len(played) == 6  # (): whether there is any
+    assert set(made) == {(), (4,)} and len(played) == 5  # (): whether there is any
     assert {found[2].shape[1] for found in played} == {10}
     header, _ = fac.read_npz(tmp_path / "run" / "student.npz", ("student",))
     assert fac.made_for(header, "student.npz")["action_repeat"] == 4
@@ -857,7 +857,7 @@ def test_an_action_repeat_goes_with_the_files_through_distill_and_evaluate(tmp_p
     refusal(lambda: fac.made_for(header, "student.npz"), "student.npz: header: action_repeat")
 
 
-def test_collected_episodes_differ_in_start_and_noise(monkeypatch):
+def test_collected_episodes_differ_in_start_and_noise(monkeypatch, tmp_path):
     made = []
 
     class Played:
@@ -868,12 +868,12 @@ def test_collected_episodes_differ_in_start_and_noise(monkeypatch):
             pass
 
         def arrays(self):
-            return np.zeros((3, 8)), np.zeros((2, 3)), np.full(2, len(made))
+            return np.zeros((5, 8)), np.zeros((4, 3)), np.full(4, len(made))
 
-    monkeypatch.setattr(fac, "EPISODE_STEPS", 2)
+    monkeypatch.setattr(fac, "CONTROL_STEPS", 8)
     monkeypatch.setattr(import_expert, "Episode", Played)
-    environment = SimpleNamespace(dim_obs=8, dim_action=3)
-    buffer = import_expert.collect(random_model(1), environment, 40, 5)
+    fac.save_model(tmp_path / "x.npz", random_model(1), {"kind": "expert", "task": TASK})
+    buffer = import_expert.collect(tmp_path / "x.npz", None, 40, 5)
     seeds, deviations = zip(*made)
     assert len(set(seeds)) == len(set(deviations)) == len(buffer) == 40
     assert 0 <= min(deviations) < 0.1 and 0.4 < max(deviations) <= import_expert.MAX_NOISE

@@ -1,4 +1,5 @@
 """Every backward pass against central differences in float64, and against live PyTorch."""
+import collections
 import dataclasses
 
 import numpy as np
@@ -106,15 +107,15 @@ def test_soft_kl(kind):
     assert np.allclose(fac.soft_kl(expert * 0.7 / 0.4 + 3, expert, 0.7, 0.4, kind)[0], 0)
 
 
-def small_case(n, batch, steps, kind, rng, expert_latent=0):
-    """A float64 student with live last layers, and a batch for it."""
+def small_case(n, batch, steps, kind, rng, expert_latent=0, groups=()):
+    """A float64 student with live last layers, and a batch for it; groups: (N,), of parts."""
     sizes = fac.ModelConfig(4, 6, n, 3, 5, 6, expert_latent_dim=expert_latent, expert_enc_dim=4)
     student = fac.WorldModel.create(sizes, rng, dtype=np.float64)
     for value in student.params.values():
         value += 0.3 * rng.standard_normal(value.shape)
     features = rng.standard_normal((1, expert_latent or 4, batch))
     actions = rng.uniform(-1, 1, (steps, 6, batch, 3))
-    targets = rng.standard_normal((3, steps, batch, 3))
+    targets = rng.standard_normal((3, *groups, steps, batch, 3))
     config = fac.DistillConfig(lam=0.7, kl=kind, temperature_student=0.8)
     return student, features, actions, targets, config
 
@@ -128,12 +129,13 @@ def test_the_divergences_that_a_curve_shows_are_means():
     np.testing.assert_allclose(found, [reward, (q1 + q2) / 2])
 
 
-@pytest.mark.parametrize("n, batch, steps, kind, latent", [
-    (1, 1, 4, "forward", 0), (2, 3, 3, "reverse", 5), (3, 1, 2, "forward", 5),
-    (6, 2, 4, "reverse", 0), (3, 2, 1, "forward", 0)])
-def test_distill_loss_through_the_rollout(n, batch, steps, kind, latent):
+@pytest.mark.parametrize("n, batch, steps, kind, latent, groups", [
+    (1, 1, 4, "forward", 0, ()), (2, 3, 3, "reverse", 5, ()), (3, 1, 2, "forward", 5, ()),
+    (6, 2, 4, "reverse", 0, ()), (3, 2, 1, "forward", 0, ()),
+    (3, 2, 3, "forward", 5, (3,)), (2, 1, 4, "reverse", 0, (2,))])
+def test_distill_loss_through_the_rollout(n, batch, steps, kind, latent, groups):
     rng = np.random.default_rng(6)
-    student, *case = small_case(n, batch, steps, kind, rng, latent)
+    student, *case = small_case(n, batch, steps, kind, rng, latent, groups)
     grads = {k: np.zeros_like(v) for k, v in student.params.items()}
     fac.distill_loss(student, *case, grads)
     for key, value in student.params.items():
@@ -141,6 +143,95 @@ def test_distill_loss_through_the_rollout(n, batch, steps, kind, latent):
         assert_close(grads[key], expected, 1e-5)
         if not (key.startswith("_expert") or key in UNSEEN) and steps > 1:
             assert np.abs(expected).max() > 1e-7, f"{key}: the check compares zeros"
+
+
+def credited(agents, noise=0.3, seed=9):
+    """A float64 expert's parts of what noise on its actions does, (2, N, 4, 3, 5): rewards' and the
+    mean Q's; its predictions of these (2, 4, 3, 5); expert, latents, actions."""
+    rng = np.random.default_rng(seed)
+    expert = fac.WorldModel.create(fac.ModelConfig(4, 6, 1, 5, 6, 7), rng, dtype=np.float64)
+    for value in expert.params.values():
+        value += 0.3 * rng.standard_normal(value.shape)
+    z, actions = rng.standard_normal((1, 5, 3)), rng.uniform(-1, 1, (4, 6, 3, 5))
+    actions = actions[..., :1] + noise * (actions - actions[..., :1])
+    tapes = collections.defaultdict(list)
+    x = fac.unroll(expert, z, actions, tapes)
+    predicted = [shares.sum(0) for shares in fac.run_heads(expert, x, actions, tapes)]
+    reward, q, again = fac.credit(expert, tapes, actions, predicted, agents)
+    assert again is q or np.array_equal(again, q)
+    return (np.stack([reward, q]), np.stack([predicted[0], (predicted[1] + predicted[2]) / 2]),
+            expert, z, actions)
+
+
+@pytest.mark.parametrize("agents", [1, 2, 6])
+def test_parts_add_up_to_what_the_noise_did(agents):
+    parts, predicted, *_ = credited(agents)
+    assert parts.shape == (2, agents, 4, 3, 5)
+    assert np.allclose(parts.sum(1), predicted - predicted[..., :1], rtol=1e-12, atol=1e-12)
+
+
+def test_a_part_is_what_its_own_actions_did():
+    """Up to what the line's two ends leave, of third order in the noise, and what joints do only
+    together, of second order."""
+    def error(noise):
+        parts, predicted, expert, z, actions = credited(3, noise)
+        errors = []
+        for i in range(3):
+            moved = np.repeat(actions[..., :1], 5, -1)
+            moved[:, 2 * i:2 * i + 2] = actions[:, 2 * i:2 * i + 2]
+            reward, q1, q2 = fac.predict(expert, z, moved)
+            alone = np.stack([reward, (q1 + q2) / 2])
+            errors.append(np.abs(parts[:, i] - (alone - alone[..., :1])).max())
+        return max(errors) / np.abs(predicted - predicted[..., :1]).max()
+
+    assert error(1e-2) < 2e-2 and error(1e-4) < 2e-4
+
+
+def test_parts_of_an_expert_that_is_a_sum_are_its_terms():
+    """Two models side by side in one expert's rewards: each agent's part is its own model's."""
+    rng = np.random.default_rng(3)
+    pair = fac.WorldModel.create(fac.ModelConfig(2, 2, 2, 3, 4, 5), rng, dtype=np.float64)
+    expert = fac.WorldModel.create(fac.ModelConfig(2, 2, 1, 6, 4, 10), rng, dtype=np.float64)
+    for key, value in pair.params.items():
+        value += 0.3 * rng.standard_normal(value.shape)
+        if not key.startswith(("_dynamics", "_reward")):
+            continue
+        whole = expert.params[key]
+        whole[:] = 0
+        if key.endswith("bias"):
+            whole[:] = value.reshape(1, -1, 1) if whole.shape[1] > 1 else value.sum()
+        elif key == "_reward.4.weight":
+            whole[:] = value.reshape(1, 1, -1)
+        else:  # inputs of a first layer: both latents, then both actions
+            out, into = value.shape[1:]
+            for i in range(2):
+                columns = (np.r_[3 * i:3 * i + 3, 6 + i] if into == 4 else
+                           np.arange(into * i, into * (i + 1)))
+                whole[0][np.ix_(np.arange(out * i, out * (i + 1)), columns)] = value[i]
+    z, actions = rng.standard_normal((1, 6, 3)), rng.uniform(-1, 1, (4, 2, 3, 5))
+    actions = actions[..., :1] + 1e-4 * (actions - actions[..., :1])
+    tapes = collections.defaultdict(list)
+    x = fac.unroll(expert, z, actions, tapes)
+    predicted = [shares.sum(0) for shares in fac.run_heads(expert, x, actions, tapes)]
+    found = fac.credit(expert, tapes, actions, predicted, 2)[0]
+    theirs = fac.unroll(pair, z.reshape(2, 3, 3), actions)
+    share = fac.run_heads(pair, theirs, actions)[0]
+    assert np.allclose(share.sum(0), predicted[0])
+    change = share - share[..., :1]
+    assert np.abs(found - change).max() < 1e-6 * np.abs(change).max()
+
+
+def test_one_agent_s_part_teaches_what_the_paper_s_joint_divergence_does():
+    parts, predicted, *_, actions = credited(1)
+    student, features, *_, config = small_case(1, 3, 4, "forward", np.random.default_rng(2))
+    found = []
+    for targets in ((parts[0], parts[1], parts[1]), (predicted[0], predicted[1], predicted[1])):
+        grads = {k: np.zeros_like(v) for k, v in student.params.items()}
+        found.append((fac.distill_loss(student, features, actions, targets, config, grads), grads))
+    (loss, grads), (joint, theirs) = found
+    assert np.allclose(loss, joint, rtol=1e-12)
+    for key, value in grads.items():
+        assert_close(value, theirs[key], 1e-9)
 
 
 def test_predict_is_the_step_by_step_rollout():
@@ -208,12 +299,12 @@ def test_flatten_gives_views():
 
 @settings(max_examples=15, deadline=None)
 @given(st.sampled_from([1, 2, 3, 6]), st.integers(1, 4), st.integers(1, 4),
-       st.sampled_from(["forward", "reverse"]), st.integers(0, 2 ** 31))
-def test_distill_loss_against_torch(n, batch, steps, kind, seed):
+       st.sampled_from(["forward", "reverse"]), st.booleans(), st.integers(0, 2 ** 31))
+def test_distill_loss_against_torch(n, batch, steps, kind, parts, seed):
     torch = pytest.importorskip("torch")
     import export_golden
-    student, features, actions, targets, config = small_case(n, batch, steps, kind,
-                                                             np.random.default_rng(seed))
+    student, features, actions, targets, config = small_case(
+        n, batch, steps, kind, np.random.default_rng(seed), 0, (n,) if parts else ())
     theirs = {k: torch.tensor(v, requires_grad=True) for k, v in student.params.items()}
     loss = export_golden.equation_4(theirs, torch.tensor(features), torch.tensor(actions),
                                    [torch.tensor(t) for t in targets], n, config)

@@ -271,6 +271,58 @@ def test_noisy_actions_of_a_policy_are_clipped():
     assert np.abs(fac.policy_rollout(model, z, [np.float32(2)] * 3)).max() == 1
 
 
+def student_of(expert, agents=3, **sizes):
+    """A student that keeps the expert's encoder, policy and dynamics, its own weights alive."""
+    config = fac.dataclasses.replace(fac.student_config(expert.config, agents, "latent", True),
+                                     latent_dim=6, mlp_dim=24, **sizes)
+    student = fac.new_student(expert, config, 0)[1]
+    rng = np.random.default_rng(3)
+    for key, value in student.params.items():
+        if not key.startswith("_expert"):
+            value += 0.3 * rng.standard_normal(value.shape, np.float32)
+    return student
+
+
+def test_a_plan_of_no_iterations_is_what_the_policy_would_do():
+    expert, obs = random_model(1, policy=True), np.linspace(-1, 1, 8, dtype=np.float32)
+    z = expert.encode(obs[:, None])
+    for model in (expert, student_of(expert)):
+        config = fac.PlannerConfig(prior="policy", iterations=0)
+        assert np.array_equal(fac.Planner(model, config).act(obs), expert.policy(z)[0, :, 0])
+        assert not fac.Planner(model, fac.PlannerConfig(iterations=0)).act(obs).any()
+
+
+@pytest.mark.parametrize("output", ["sampled", "mean"])
+def test_a_search_around_the_policy_starts_there_every_time(output):
+    """In each agent's own part of the expert's rollout, with the first deviation for width."""
+    expert = random_model(1, policy=True)
+    student, seen = student_of(expert), []
+    config = fac.PlannerConfig(prior="policy", samples=400, iterations=1, min_std=0.01,
+                               max_std=0.01, horizon=2, output=output)
+    planner, obs = fac.Planner(student, config), np.full(8, 0.3, np.float32)
+    start = planner.own.fast.start
+    planner.own.fast.start = lambda *args: (
+        lambda G: lambda actions: seen.append(actions) or G(actions))(start(*args))
+    rollout = fac.policy_rollout(expert, expert.encode(obs[:, None]), [np.float32(0)] * 3)
+    for _ in range(2):
+        planner.act(obs)
+    for actions in seen:  # (N, L, 1, S)
+        assert np.abs(actions.mean(-1)[..., 0] - rollout[:, 0, :, 0].T).max() < 0.01
+        assert actions.std(-1).max() < 0.015
+
+
+def test_a_policy_to_start_from_is_needed():
+    for model in (random_model(1), random_model(3), student_of(random_model(1, policy=True),
+                                                               expert_mlp_dim=0)):
+        with pytest.raises(fac.UserError, match="prior: the model has no policy"):
+            fac.Planner(model, fac.PlannerConfig(prior="policy"))
+
+
+def test_an_observation_of_the_wrong_size_is_refused():
+    with pytest.raises(fac.UserError, match=r"\(8,\), found \(7,\)"):
+        fac.Planner(random_model()).act(np.zeros(7))
+
+
 def test_an_observation_of_the_wrong_size_or_without_numbers_is_refused():
     with fac.Planner(random_model()) as planner:
         for wrong, text in ((np.zeros(7), r"\(8,\), found \(7,\)"),
@@ -300,6 +352,16 @@ def shared_memory():
     """What multiprocessing has made there; others' come and go."""
     names = os.listdir("/dev/shm") if os.path.isdir("/dev/shm") else []
     return sorted(name for name in names if name.startswith(("psm_", "sem.mp-")))
+
+
+def test_workers_begin_where_the_policy_does():
+    student = student_of(random_model(1, policy=True))
+    config = fac.PlannerConfig(samples=32, iterations=2, prior="policy", max_std=0.2)
+    obs, plans = np.random.default_rng(1).standard_normal((3, 8)), []
+    for workers in (0, 1, 2):
+        with fac.Planner(student, config, 0, workers) as planner:
+            plans.append([planner.act(o) for o in obs])
+    assert np.array_equal(plans[0], plans[1]) and np.array_equal(plans[0], plans[2])
 
 
 @pytest.mark.parametrize("n, d, workers", [(3, 1, 1), (3, 1, 2), (2, 3, 1), (6, 1, 3)])
@@ -424,7 +486,7 @@ def test_a_policy_needs_one_agent():
 
 def test_an_interrupted_decision_ends_the_workers(monkeypatch):
     """Their answers, unread, would be taken for those of the next decision."""
-    def interrupt(z):
+    def interrupt(*_):
         raise KeyboardInterrupt
 
     with fac.Planner(random_model(), fac.PlannerConfig(samples=16), workers=1) as planner:
