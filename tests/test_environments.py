@@ -15,6 +15,7 @@ sys.path.insert(0, str(ROOT))
 
 import fac_tdmpc_ref as fac  # noqa: E402
 import train_expert  # noqa: E402
+from test_planning import random_model  # noqa: E402
 
 FIGURE_3 = {  # task: (dim O, dim A), copied from the paper and not from the code
     "reacher-easy": (8, 3), "reacher-hard": (8, 3), "hopper-hop": (15, 4), "fish-swim": (24, 5),
@@ -153,6 +154,23 @@ def test_an_action_repeat_that_does_not_divide_an_episode_is_refused(repeat):
             refuse()
     with pytest.raises(fac.UserError, match="horizon must be below 8, an episode's decisions"):
         fac.PlannerConfig(action_repeat=125, horizon=8)
+
+
+def test_noise_of_played_episodes_has_another_deviation_in_each(monkeypatch):
+    monkeypatch.setattr(fac, "CONTROL_STEPS", 100)
+    expert = random_model(1, policy=True)
+    for key in ("_pi.4.weight", "_pi.4.bias"):
+        expert.params[key][:] = 0  # so that what is done is the noise
+    robot = SimpleNamespace(reset=lambda seed: np.zeros(8), step=lambda action: (np.zeros(8), 0.0))
+    config, seeds = fac.PlannerConfig(prior="policy", iterations=0), list(range(40))
+    done, again, other, still = (fac.play(expert, None, config, of, 0, "", robot, noise)[1]
+                                 for of, noise in ((seeds, 0.3), (seeds[::-1], 0.3), (seeds, 0.6),
+                                                   (seeds[:2], 0.0)))
+    deviations = done.std((1, 2))
+    assert np.array_equal(done, again[::-1]) and not still.any()
+    assert 0 <= deviations.min() < 0.05 and 0.25 < deviations.max() < 0.35
+    assert len(set(deviations.tolist())) == 40 and np.abs(other).max() == 1
+    assert abs(deviations.mean() - 0.15) < 0.05 and np.abs(done.mean((1, 2))).max() < 0.1
 
 
 def test_an_environment_of_one_s_own_is_played_here_whatever_its_truth_value():
