@@ -1141,6 +1141,16 @@ class AgentPlanner:
         return policy_rollout(self.model, np.repeat(z, P, 2), noise).swapaxes(0, 1)
 
 
+def teacher_of(model, config):
+    """The expert whose policy plans begin from: a student's, or the model itself. UserError: it has
+    none, and the config wants one."""
+    teacher = model.expert or model
+    need(config.prior == "none" or teacher.has_policy, "the model holds no policy of an expert for "
+         "plans to begin from, since the expert has none or the student's encoder reads the "
+         "observation; pass --plan-prior none (evaluate: --prior none)")
+    return teacher
+
+
 class Planner(contextlib.ExitStack):  # whose `close` ends the workers
     """Observation in, action out; an episode's next plan starts from the last one's mean.
 
@@ -1155,9 +1165,7 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
 
     def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
         self.model, self.config, sequence = model, config, seed_sequence(seed)
-        self._teacher = model.expert or model  # whose policy a plan may begin from
-        need(config.prior == "none" or self._teacher.has_policy, "planner: prior: the model has no "
-             "policy to begin from; pass none")
+        self._teacher = teacher_of(model, config)
         check_memory(planning_numbers(model.config, config), config, model.config)
         self._parts = split_agents(model.config.num_agents, workers)
         own, *others = ((model.agents(part.start, part.stop), config) for part in self._parts)
@@ -2030,6 +2038,7 @@ def command_distill(args):
                                       args.seed)) as distiller, locked(out):
         for model, config in ((expert, own), (distiller.student, planning)):
             check_memory(planning_numbers(model.config, config), config, model.config)
+        teacher_of(distiller.student, planning)  # what is missing is missed now
         result, planning = distil_and_save(distiller, args, planning, header, out)
         obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
         both = (expert, own), (distiller.student, planning)

@@ -281,6 +281,7 @@ def refused(done, *parts, program="fac_tdmpc_ref.py"):
     (["--noise-std", "nan"], ["noise_std", "nan"]),
     (["--lr", "inf"], ["lr", "finite"]),
     (["--expert-episodes", "1", "--played-share", "0"], ["played_share", "above 0", "not 0.0"]),
+    (["--encoder-input", "observation"], ["no policy", "--plan-prior none"]),
     (["--held-out", "1"], ["held_out", "at least 0.0001 and at most 0.5"]),
     (["--held-out", "0.05"], ["replay.npz", "6 episodes are too few"]),
     (["--kl", "sideways"], ["--kl", "'sideways'", "forward"]),

@@ -314,7 +314,7 @@ def test_a_search_around_the_policy_starts_there_every_time(output):
 def test_a_policy_to_start_from_is_needed():
     for model in (random_model(1), random_model(3), student_of(random_model(1, policy=True),
                                                                expert_mlp_dim=0)):
-        with pytest.raises(fac.UserError, match="prior: the model has no policy"):
+        with pytest.raises(fac.UserError, match="no policy of an expert.*--plan-prior none"):
             fac.Planner(model, fac.PlannerConfig(prior="policy"))
 
 
