@@ -2030,7 +2030,7 @@ def command_distill(args):
     theirs = {**preset(PlannerConfig), **made_for(header, path)}
     own = PlannerConfig(**theirs)  # the expert's
     around = args.preset == "default" and getattr(args, "PlannerConfig.prior") != "none"
-    planning = from_args(PlannerConfig, args, **theirs, **(STUDENT_PLANNING if around else {}))
+    planning = from_args(PlannerConfig, args, **{**theirs, **(STUDENT_PLANNING if around else {})})
     planning = dataclasses.replace(planning, horizon=config.horizon)
     out = Path(args.out or f"runs/{args.task}-{args.seed}")
     record = read_records(path).get(record_key(expert, own, args.eval_seed), ([], {}))
