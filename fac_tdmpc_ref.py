@@ -1238,9 +1238,9 @@ def plan_gains(expert, model, config, obs, seed=0):
 
 
 def search_width(distiller, config, states=128):
-    """The deviation of WIDTHS with which a student's search gains most by the expert's G, less a
-    standard error, in held-out states; and of each [width, mean gain, its standard error, mean
-    promise] [D9]."""
+    """The smallest deviation of WIDTHS with which a student's search gains, by the expert's G in
+    held-out states, no less than the best one less its standard error; and of each [width, mean
+    gain, its standard error, mean promise] [D9]."""
     starts = stream(distiller.seed, "search width").choice(distiller.held_out_starts, states)
     (obs, _), rows = distiller.replay.sequences(starts, 1), []
     for width in WIDTHS:
@@ -1248,7 +1248,8 @@ def search_width(distiller, config, states=128):
             config, max_std=width, min_std=min(width, config.min_std)), obs, distiller.seed)
         rows.append([width, *map(float, (gain.mean(), gain.std(ddof=1) / np.sqrt(states),
                                          promise.mean()))])
-    return max(rows, key=lambda row: row[1] - row[2])[0], rows
+    _, gain, error, _ = max(rows, key=lambda row: row[1])
+    return next(row[0] for row in rows if row[1] >= gain - error), rows
 
 
 # ---- The same, fast: a first reading skips this. `Returns` computes h_step_return.

@@ -363,22 +363,24 @@ def test_what_plans_gain_is_told_by_the_expert_and_promised_by_the_model(replay)
                                rtol=1e-4, atol=1e-5)
 
 
-def test_a_search_is_as_wide_as_gains_most_less_a_standard_error(replay, monkeypatch):
-    means = dict(zip(fac.WIDTHS, (0.1, 0.3, 0.35, 0.2, 0.1, 0.0)))
-    seen = []
+def test_a_search_is_no_wider_than_gains_more_than_a_standard_error(replay, monkeypatch):
+    means = dict(zip(fac.WIDTHS, (0.1, 0.3, 0.75, 0.7, 0.8, 0.0)))
+    seen, spread = [], []
 
     def gains(expert, model, config, obs, seed):
         seen.append((model, obs.tobytes()))
-        return (means[config.max_std] + (config.max_std == 0.15) * np.array([2.0, -2.0] * 8),
+        return (means[config.max_std] + (config.max_std == 0.4) * np.array([1, -1] * 8) * spread[-1],
                 np.full(16, config.max_std))
 
     monkeypatch.setattr(fac, "plan_gains", gains)
     with fresh(replay, CONFIG) as distiller:
-        width, rows = fac.search_width(distiller, fac.PlannerConfig(prior="policy"), 16)
+        for value, expected in ((0.0, 0.4), (0.28, 0.15), (0.4, 0.15), (2.2, 0.1)):
+            spread.append(value)
+            width, rows = fac.search_width(distiller, fac.PlannerConfig(prior="policy"), 16)
+            assert width == expected and [row[0] for row in rows] == list(fac.WIDTHS)
         assert {model for model, _ in seen} == {distiller.student}
         held = replay.observation[distiller.held_out_starts].astype(np.float32)
-    assert width == 0.1 and [row[0] for row in rows] == list(fac.WIDTHS)
-    assert rows[2][1:] == pytest.approx([0.35, 2 * np.sqrt(16 / 15) / 4, 0.15])
+    assert rows[4][1:] == pytest.approx([0.8, 2.2 * np.sqrt(16 / 15) / 4, 0.4])
     ((_, obs),) = {(None, obs) for _, obs in seen}  # all in the same states, which were held out
     assert all((held == o).all(1).any() for o in np.frombuffer(obs, np.float32).reshape(8, -1).T)
 
