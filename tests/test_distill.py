@@ -369,8 +369,8 @@ def test_a_search_is_no_wider_than_gains_more_than_a_standard_error(replay, monk
 
     def gains(expert, model, config, obs, seed):
         seen.append((model, obs.tobytes()))
-        return (means[config.max_std] + (config.max_std == 0.4) * np.array([1, -1] * 8) * spread[-1],
-                np.full(16, config.max_std))
+        scatter = (config.max_std == 0.4) * np.array([1, -1] * 8) * spread[-1]
+        return means[config.max_std] + scatter, np.full(16, config.max_std)
 
     monkeypatch.setattr(fac, "plan_gains", gains)
     with fresh(replay, CONFIG) as distiller:
