@@ -1144,11 +1144,14 @@ def test_watch_writes_a_moving_picture(tmp_path, name):
 
 @pytest.mark.parametrize("flags, parts", [
     (["--model", "none.npz", "--out", "x.gif"], ["none.npz", "no such file"]),
-    (["--model", str(fac.data_file("reacher-hard", "expert.npz")), "--out", "x.gif", "--decisions",
-      "501"], ["500", "501"]),
+    (["--model", "slow.npz", "--out", "x.gif", "--decisions", "251"], ["250", "251"]),
+    (["--model", "slow.npz", "--beside", fac.DATA / "reacher-hard" / "expert.npz", "--out",
+      "x.gif"], ["expert.npz: decides every 2 control steps", "slow.npz every 4"]),
     (["--model", "none.npz", "--out", "x.png"], ["x.png", ".gif", ".mp4"])])
 def test_watch_refuses(tmp_path, flags, parts):
     pytest.importorskip("matplotlib")
+    expert, header = fac.load_model(fac.data_file("reacher-hard", "expert.npz"))
+    fac.save_model(tmp_path / "slow.npz", expert, {**header, "action_repeat": 4})
     refused(run("watch", *flags, cwd=tmp_path), *parts)
 
 
