@@ -814,9 +814,18 @@ def test_a_csv_without_a_row_is_begun_anew(tmp_path, left):
     assert len(experiments.read_rows(path)) == 1 and path.read_text().count("task") == 1
 
 
+def short_expert_episodes(monkeypatch):
+    """Two of ones instead of reacher's 96."""
+    monkeypatch.setattr(fac, "expert_episodes", lambda *_: (np.ones((2, 500, 8)),
+                                                            np.ones((2, 500, 3))))
+
+
 def test_figure_13_distils_and_times_every_number_of_agents(tmp_path, monkeypatch):
     pytest.importorskip("joblib")
     monkeypatch.chdir(tmp_path)
+    short_expert_episodes(monkeypatch)  # in this process
+    monkeypatch.setattr(experiments, "in_processes", lambda function, runs, jobs: (
+        experiments.attempt(function, run, os.getpid()) for run in runs))
     flags = ["--tasks", "reacher-easy", "--seeds", "0", "1", "--jobs", "1", "--steps", "1",
              "--episodes", "1", "--evaluations", "1", "--samples", "4", "--iterations", "1",
              "--rounds", "2"]
@@ -1029,6 +1038,7 @@ def test_the_table_of_students_has_a_line_for_each_budget_and_columns_for_each_p
 
 def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkeypatch):
     steps, step, rows = [], fac.Distiller.step, []
+    short_expert_episodes(monkeypatch)
     monkeypatch.setattr(fac.Distiller, "step", lambda self: (steps.append(1), step(self))[1])
     monkeypatch.setattr(fac, "rank_results", lambda *_: {
         "rank_correlation": 0.5, "rank_correlation_episodes": 1, **{
