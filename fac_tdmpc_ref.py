@@ -583,6 +583,13 @@ def policy_rollout(model, z, noise):
     return np.stack(actions)
 
 
+def policy_plan(expert, z, steps, agents=1):
+    """What an expert's policy would do from z (1, m, B) on, rolled out in its model: each of so
+    many agents' part, (N, L, d, B)."""
+    actions = policy_rollout(expert, z, [F32(0)] * steps)
+    return actions.reshape(steps, agents, -1, z.shape[2]).swapaxes(0, 1)
+
+
 def networks(config, policy=False):
     """(name, layer kinds, agents, widths) of every network of a model."""
     n, m, hidden = config.num_agents, config.latent_dim, (config.mlp_dim, config.mlp_dim)
@@ -794,7 +801,7 @@ def around_policy(expert, obs, actions, share, rng):
     chosen = rng.random(obs.shape[1]) < share
     if chosen.any():
         z, actions = expert.encode(obs[:, chosen]), actions.copy()
-        actions[:, :, chosen] = policy_rollout(expert, z, [F32(0)] * len(actions))[:, 0]
+        actions[:, :, chosen] = policy_plan(expert, z, len(actions))[0]
     return actions
 
 
@@ -1208,10 +1215,8 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
         """The expert's policy from obs (O,) on, rolled out in its model: (N, L, d), or None."""
         if self.config.prior == "none":
             return None
-        actions = policy_rollout(self._teacher, self._teacher.encode(obs[:, None]),
-                                 [F32(0)] * (self.config.horizon + 1))
-        sizes = self.model.config
-        return actions.reshape(-1, sizes.num_agents, sizes.agent_actions).swapaxes(0, 1)
+        return policy_plan(self._teacher, self._teacher.encode(obs[:, None]),
+                           self.config.horizon + 1, self.model.config.num_agents)[..., 0]
 
 
 WIDTHS = 0.05, 0.1, 0.15, 0.25, 0.4, 0.6  # deviations that a search around the policy may have
@@ -1223,15 +1228,13 @@ def plan_gains(expert, model, config, obs, seed=0):
     two (S,)."""
     with one_thread():
         z, own, planner = expert.encode(obs), model.encode(obs), AgentPlanner(model, config)
-        policy = policy_rollout(expert, z, [F32(0)] * (config.horizon + 1))[:, 0]
-        L, N, states = len(policy), len(own), obs.shape[1]
+        policy, plans = policy_plan(expert, z, config.horizon + 1, len(own)), []
         first = policy * F32(config.prior == "policy")
-        first = first.reshape(L, N, -1, states).transpose(3, 1, 0, 2)
-        plans = []
-        for i, seeds in enumerate(seed_sequence(seed).spawn(states)):
-            planner.reset(seeds.spawn(N))
-            plans.append(planner.search(own[:, :, i:i + 1], first[i])[0])
-        both = np.stack([np.stack(plans, -1).swapaxes(0, 1).reshape(policy.shape), policy], -1)
+        for i, seeds in enumerate(seed_sequence(seed).spawn(obs.shape[1])):
+            planner.reset(seeds.spawn(len(own)))
+            plans.append(planner.search(own[:, :, i:i + 1], first[..., i])[0])
+        both = np.stack([np.stack(plans, -1), policy], -1).swapaxes(0, 1)  # (L, N, d, S, 2)
+        both = both.reshape(len(both), -1, *both.shape[3:])
         G = [horizon_returns(*predict(*of, both), config.discount)[-1]
              for of in ((expert, z), (model, own))]
     return [g[:, 0] - g[:, 1] for g in G]

@@ -15,6 +15,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import fac_tdmpc_ref as fac  # noqa: E402
+from numpy_learner import latents_after, latents_after_backward  # noqa: E402
 
 # ------------------------------------------------------------------ other losses, other sizes
 
@@ -39,20 +40,17 @@ def consistency_loss(student, features, actions, targets, config, grads=None):
     tapes, encoder_tape, end_tape, weight = defaultdict(list), [], [], 2.0
     z = student.encode_features(features, encoder_tape)
     L, _, B, K = actions.shape
-    x, now = fac.unroll(student, z, actions, tapes), slice(-B * K, None)
+    x = fac.unroll(student, z, actions, tapes)
     (loss, *means), d_shares = fac.divergences(fac.run_heads(student, x, actions, tapes), targets,
                                                config)
-    end = fac.forward(fac.MLP, student.params, "_dynamics", x[:, :, now], end_tape)
     n, m = student.config.num_agents, student.config.latent_dim
-    own = np.concatenate([x[:, :m, B * K:], end], 2)
+    own = latents_after(student, x, B * K, end_tape)
     goal = student.encode_features(after.reshape(1, len(after), -1))
     lam = np.repeat(config.lam ** np.arange(L), B * K).astype(z.dtype)
     gap, scale = own - goal, weight / (n * m * B * K)
     if grads is not None:
-        d, dx = 2 * scale * lam * gap, fac.heads_backward(student, tapes, d_shares, grads)
-        dx[:, :m, B * K:] += d[:, :, :-B * K]
-        dx[:, :, now] += fac.backward(fac.MLP, student.params, "_dynamics", end_tape,
-                                      d[:, :, now], grads)
+        dx = fac.heads_backward(student, tapes, d_shares, grads)
+        latents_after_backward(student, end_tape, 2 * scale * lam * gap, dx, B * K, grads)
         dz = fac.unroll_backward(student, tapes, actions, dx, grads)
         fac.backward(fac.ENCODER, student.params, "_encoder", encoder_tape,
                      dz.reshape(1, -1, B), grads)
@@ -69,8 +67,7 @@ class ConsistentDistiller(fac.Distiller):
         features, actions, targets = super().draw(number, part, size)
         steps, _, *columns = actions.shape
         x = fac.unroll(self.expert, features, actions)
-        end = fac.forward(fac.MLP, self.expert.params, "_dynamics", x[:, :, -np.prod(columns):])
-        after = np.concatenate([x[:, :features.shape[1], np.prod(columns):], end], 2)
+        after = latents_after(self.expert, x, np.prod(columns))
         return features, actions, [*targets, after.reshape(-1, steps, *columns)]
 
 

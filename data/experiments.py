@@ -28,7 +28,6 @@ import sys
 import time
 from collections import Counter, defaultdict
 from concurrent.futures import BrokenExecutor
-from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -162,12 +161,9 @@ def attempt(function, run, home):
 
 
 def versions():
-    """What returns depend on beside a run's settings: a package's name and version each."""
-    found = []
-    for name in ("numpy", "mujoco", "fac-tdmpc-ref"):
-        with contextlib.suppress(metadata.PackageNotFoundError):  # a clone that isn't installed
-            found.append(f"{name} {metadata.version(name)}")
-    return ", ".join(found)
+    """`fac.software`, as a row holds it."""
+    found = fac.software()
+    return ", ".join(f"{name} {found[name]}" for name in ("numpy", "mujoco", "fac-tdmpc-ref"))
 
 
 def failed(run, error):

@@ -51,6 +51,20 @@ def td_targets(model, target, obs, reward, noise, discount):
     return target.encode(after), reward + discount * q.reshape(reward.shape)
 
 
+def latents_after(model, x, columns, tape=None):
+    """s_1, ..., s_L (N, m, L * columns) of `fac.unroll`'s x, which ends with s_{L-1}; the tape is
+    the last step's."""
+    end = fac.forward(fac.MLP, model.params, "_dynamics", x[:, :, -columns:], tape)
+    return np.concatenate([x[:, :model.config.latent_dim, columns:], end], 2)
+
+
+def latents_after_backward(model, tape, d, dx, columns, grads):
+    """Walk `latents_after` back: adds its gradient d to x's, dx, and to `grads`."""
+    dx[:, :model.config.latent_dim, columns:] += d[:, :, :-columns]
+    dx[:, :, -columns:] += fac.backward(fac.MLP, model.params, "_dynamics", tape,
+                                        d[:, :, -columns:], grads)
+
+
 def equation_1(model, obs, actions, reward, latents, td, config, grads=None):
     """Equation 1 and, into the dict `grads`, its gradients.
 
@@ -67,8 +81,7 @@ def equation_1(model, obs, actions, reward, latents, td, config, grads=None):
     tapes, encoder_tape, end_tape, actions = defaultdict(list), [], [], actions[..., None]  # K = 1
     z = model.encode_features(obs[None], encoder_tape)
     m, x = z.shape[1], fac.unroll(model, z, actions, tapes)
-    end = fac.forward(fac.MLP, model.params, "_dynamics", x[:, :, -B:], end_tape)
-    rollout = np.concatenate([x[:, :m], end], 2)
+    after = latents_after(model, x, B, end_tape)
     lam = (config.lam ** np.arange(H) / B).astype(z.dtype)[:, None]
     terms, d_shares = [], []
     coefs = (config.reward_coef, config.value_coef, config.value_coef)
@@ -76,7 +89,7 @@ def equation_1(model, obs, actions, reward, latents, td, config, grads=None):
         error = shares.sum(0)[..., 0] - goal
         terms.append(float((lam * error ** 2).sum()))
         d_shares.append((2 * coef / H * lam * error)[None, ..., None])
-    gap = (rollout[:, :, B:] - latents).reshape(*z.shape[:2], H, B)
+    gap = (after - latents).reshape(*z.shape[:2], H, B)
     lam = lam / m
     terms.insert(0, float((lam * gap ** 2).sum()))
     terms = [terms[0], terms[1], terms[2] + terms[3]]
@@ -84,12 +97,10 @@ def equation_1(model, obs, actions, reward, latents, td, config, grads=None):
     if grads is not None:
         d_latents = (2 * config.consistency_coef / H * lam * gap).reshape(1, m, -1)  # of s_1 .. s_H
         dx = fac.heads_backward(model, tapes, d_shares, grads)
-        dx[:, :m, B:] += d_latents[:, :, :-B]
-        dx[:, :, -B:] += fac.backward(fac.MLP, model.params, "_dynamics", end_tape,
-                                      d_latents[:, :, -B:], grads)
+        latents_after_backward(model, end_tape, d_latents, dx, B, grads)
         dz = fac.unroll_backward(model, tapes, actions, dx, grads)
         fac.backward(fac.ENCODER, model.params, "_encoder", encoder_tape, dz, grads)
-    return float(loss), terms, rollout
+    return float(loss), terms, np.concatenate([z, after], 2)
 
 
 def policy_loss(model, rollout, noise, lam, grads):
