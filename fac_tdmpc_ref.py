@@ -1636,7 +1636,7 @@ def read_npz(path, kinds):
     return header, arrays
 
 
-def save_model(path, model, header):
+def save_model(path, model, header, compress=False):
     """Weights under TD-MPC's names; torch shapes where N = 1, else with a leading agent axis."""
     arrays = {}
     for key, value in model.params.items():
@@ -1644,7 +1644,7 @@ def save_model(path, model, header):
         value = value[..., 0] if key.endswith("bias") or key.split(".")[1] == "1" else value
         need(np.isfinite(value).all(), f"{path}: {key}: would hold values that are not finite")
         arrays[key] = value[0] if len(value) == 1 else value
-    write_npz(path, {**header, "model": asdict(model.config)}, arrays)
+    write_npz(path, {**header, "model": asdict(model.config)}, arrays, compress)
 
 
 def load_model(path, kinds=("expert", "student")):
