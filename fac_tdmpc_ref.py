@@ -1,13 +1,16 @@
 """Fac-TDMPC in NumPy: a factored world model for robot planning, in one file.
 
 A TD-MPC expert (encoder, dynamics, reward, value; planning by MPPI in latent space) is distilled
-into a student whose latent state, dynamics, reward and value fall apart into one small model for
-each action dimension. Each joint then plans alone: cheaper, and in parallel. Here is the method:
-networks with hand-written gradients, Adam, Algorithm 1 (Equation 4), MPPI (Equations 2 and 3),
-planning workers, environments, files, two commands. What uses it, Equation 1 too, is in data/.
+into a student whose latent, dynamics, reward and value fall apart into one small model for each
+action dimension. Each joint then plans alone: cheaper, and in parallel.
 
     python fac_tdmpc_ref.py distill --task reacher-hard
     python fac_tdmpc_ref.py evaluate --model runs/reacher-hard-0/student.npz
+
+Part I is the method as the paper has it, to be read from top to bottom: 1 settings, 2 layers,
+3 world model, 4 distillation (Equation 4, Algorithm 1), 5 planning (Equations 2 and 3). It runs
+(`distill --plain`). Part II is what is added to it, the same in less time, and engineering. Experts
+learn, by Equation 1, in data/. Departures from the paper, [D1] to [D9], are in the README.
 
 The one idea that keeps it small: every model carries an agent axis N, and a centralized model is
 the case N = 1. There is one world model, one planner, one loss. The axes, everywhere:
@@ -21,85 +24,36 @@ the case N = 1. There is one world model, one planner, one loss. The axes, every
     H   horizon: a return G is H rewards, then Q;   L   actions of a sequence: H + 1 (Eq. 2 and 4)
     F   features an encoder reads;   P   proposals;   E   elites, or episodes;   T   decisions
 
+A decision is one planned action, which the robot repeats for two control steps; a proposal is an
+action sequence that the expert's policy suggests to a plan. What a student computes in training:
+
+    observation g (O, B) -> the expert's f_E, frozen -> its latent (1, F, B)
+      -> the student's f_E -> cut into s^1, ..., s^N: (N, m, B), each repeated for K copies
+    (s^i_h, a^i_h) -> f_T^i -> s^i_{h+1} for h = 0 ... H: columns (L, B, K), copies side by side
+                   -> f_R^i, f_Q^i -> agent i's shares of reward and value (N, L, B, K)
+    sum over i -> R_h, Q_h (L, B, K) -> softmax over K -> divergence from the expert's (Equation 4)
+
 A layer is W (N, out, in), b (N, out, 1) and computes W @ x + b on x (N, in, B): samples last, so
 that activations run over long contiguous rows, and a torch Linear.weight goes in as weight[None].
-Rewards and values come out as (N, B), agent i's share; the global one is their sum over N.
-
-Read it from top to bottom: 1 configuration, 2 layers, 3 world model, 4 distillation, 5 planning,
-6 environments, 7 files, 8 commands. A first reading may skip what is marked "the same, fast" and
-"the same, in processes" in section 5. Departures from the paper, [D1] ..., are in the README.
 """
 from __future__ import annotations
 
-import argparse
-import contextlib
-import csv
 import dataclasses
-import difflib
 import functools
-import importlib.metadata
-import itertools
-import json
-import math
-import multiprocessing
-import operator
-import os
-import pickle
-import signal
-import sys
-import tempfile
-import time
-import warnings
 import zlib
 from collections import defaultdict
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
-from multiprocessing import resource_tracker
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 
-__version__ = "0.1.0"  # to be raised where plans change: recorded returns name it
 F32 = np.float32
-DATA = Path(__file__).resolve().parent / "data"
 
 
-class UserError(Exception):
-    """Something the user can mend: printed as one line, exit status 2."""
-
-
-def need(condition, message):
-    """UserError with this message unless the condition holds."""
-    if not condition:
-        raise UserError(message)
-
-
-def count(value, name, most=10 ** 9):
-    """The value, if it's a whole number from 0 to `most`; else UserError."""
-    need(isinstance(value, (int, np.integer)) and 0 <= value <= most,
-         f"{name}: expected a whole number from 0 to {most}, found {value!r}")
-    return value
-
-
-def check_finite(values, update, lr):
-    """UserError if learning diverged, before its weights are saved."""
-    for name, value in values.items():
-        need(np.isfinite(value).all(), f"after update {update} the {name} no longer finite: "
-             f"learning diverged; lower the learning rate ({lr})")
-
-
-# ==== 1. Configuration ================================================================
+# ==== 1. Settings =====================================================================
 
 CONTROL_STEPS = 1000  # of dm_control, in an episode
 ACTION_REPEAT = 2  # control steps a decision, whose rewards are added; a model's file may differ
 EPISODE_STEPS = CONTROL_STEPS // ACTION_REPEAT  # T: decisions in an episode
-
-
-def episode_steps(action_repeat):
-    """T for this many control steps a decision; UserError if an episode doesn't divide by it."""
-    need(action_repeat in divisors(CONTROL_STEPS), f"action_repeat: expected a divisor of "
-         f"{CONTROL_STEPS}, an episode's control steps, found {action_repeat!r}")
-    return CONTROL_STEPS // action_repeat
 
 
 def field(default, help, repr=True, **about):
@@ -107,32 +61,11 @@ def field(default, help, repr=True, **about):
     return dataclasses.field(default=default, repr=repr, metadata={"help": help, **about})
 
 
-RANGE = {"least": ("at least {}", operator.ge), "above": ("above {}", operator.gt),
-         "most": ("at most {}", operator.le),
-         "choices": ("one of {}", lambda value, choices: value in choices)}
-
-
 class Settings:
-    """Base of the configs below: UserError for a type or a value that its field rules out."""
+    """Base of the settings below, whose values Part II checks as they are made."""
 
     def __post_init__(self):
-        for f in dataclasses.fields(self):
-            value, cls = getattr(self, f.name), type(f.default)
-            if np.dtype(type(value)).kind not in {int: "iu", float: "iuf", bool: "b"}.get(cls, "U"):
-                self.refuse(f.name, f"of type {cls.__name__}")
-            rules = [(words.format(f.metadata[bound]), holds(value, f.metadata[bound]))
-                     for bound, (words, holds) in RANGE.items() if bound in f.metadata]
-            if cls is float:
-                rules.append(("finite, as a float32", abs(value) < 3e38))
-            elif cls is int and value > 10 ** 9:
-                rules.append(("at most 10^9", False))
-            if not all(holds for _, holds in rules):
-                self.refuse(f.name, " and ".join(words for words, _ in rules))
-            object.__setattr__(self, f.name, cls(value))  # 1 is 1.0, and NumPy's are Python's
-
-    def refuse(self, name, rule):
-        """Raise UserError for the value of the field `name`."""
-        raise UserError(f"{type(self).__name__}: {name} must be {rule}, not {vars(self)[name]!r}")
+        check_settings(self)
 
 
 @dataclass(frozen=True)
@@ -144,17 +77,9 @@ class ModelConfig(Settings):
     latent_dim: int = field(50, "m: latent features of an agent (Table 2)", least=1)
     enc_dim: int = field(256, "hidden width of the encoder (Table 2)", least=1)
     mlp_dim: int = field(512, "hidden width of an agent's other networks (Table 2)", least=1)
-    expert_latent_dim: int = field(0, "width of the expert's latent that the encoder reads; 0: it "
-                                   "reads the observation", least=0)
-    expert_enc_dim: int = field(256, "hidden width of the frozen expert encoder below it", least=1)
-    expert_mlp_dim: int = field(0, "hidden width of the expert's frozen policy and dynamics, which "
-                                "say where a plan begins; 0: there are none", least=0)
-
-    def __post_init__(self):
-        super().__post_init__()
-        if self.num_agents not in divisors(self.dim_action):
-            self.refuse("num_agents", f"one of {divisors(self.dim_action)}, as "
-                        f"{self.dim_action} action dimensions are shared evenly")
+    expert_latent_dim: int = field(0, "of the expert's latent, if that is encoded", least=0)
+    expert_enc_dim: int = field(256, "hidden width of the expert's encoder", least=1)
+    expert_mlp_dim: int = field(0, "of its frozen policy and dynamics [D9]; 0: none", least=0)
 
     @property
     def agent_actions(self):
@@ -165,46 +90,27 @@ class ModelConfig(Settings):
 @dataclass(frozen=True)
 class PlannerConfig(Settings):
     """MPPI. Raises UserError for values that can't plan."""
-    samples: int = field(128, "S: action sequences drawn in an iteration [D5]", paper=512, least=1,
-                         most=10 ** 6)
-    iterations: int = field(4, "refinements of the Gaussian in a decision [D5]; 0: its first mean "
-                               "is the action", paper=6, least=0)
-    prior: str = field("none", "a plan's first mean: the last plan's, moved on by one (none), or "
-                       "what the expert's policy would do [D9]", repr=False,
-                       choices=("none", "policy"))
+    samples: int = field(128, "S: sequences drawn at once [D5]", paper=512, least=1, most=10 ** 6)
+    iterations: int = field(4, "of MPPI [D5]; 0: its first mean acts", paper=6, least=0)
+    prior: str = field("none", "first mean: the last plan's, or of the expert's policy [D9]",
+                       repr=False, choices=("none", "policy"))
     elites: int = field(0, "best ones, which refine it; 0: samples / 8 (Table 2: 64)", least=0)
-    pi_trajs: int = field(24, "policy proposals, where there is a policy (Table 2)", least=0,
-                          most=10 ** 6)
-    horizon: int = field(3, "H of Equation 2 (Table 2); `evaluate` takes the model file's own",
-                         least=0, most=EPISODE_STEPS - 1)
-    discount: float = field(0.99, "gamma (Table 2); commands take the model file's own",
-                            least=0, most=1)
+    pi_trajs: int = field(24, "P: policy proposals (Table 2)", least=0, most=10 ** 6)
+    horizon: int = field(3, "H of Equation 2; or a file's", least=0, most=EPISODE_STEPS - 1)
+    discount: float = field(0.99, "gamma (Table 2); or a file's", least=0, most=1)
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)", above=0)
-    max_std: float = field(2.0, "first and largest sampling deviation (Table 2); distill "
-                           "chooses one of six for a search around the policy [D9]", above=0)
-    inverse_temperature: float = field(0.5, "an elite weighs exp(this * return); `temperature` of "
-                                       "Table 2, by which TD-MPC's code multiplies", above=0)
+    max_std: float = field(2.0, "largest and first one (Table 2); distill: [D9]", above=0)
+    inverse_temperature: float = field(0.5, "an elite weighs exp(this * G) (Table 2)", above=0)
     momentum: float = field(0.1, "part of the old mean in the new (TD-MPC's code)", least=0, most=1)
-    returns: str = field("fast", "Equation 2 as it reads (plain: h_step_return), or the same, fast",
-                         choices=("fast", "plain"))
-    output: str = field("sampled", "the action: an elite drawn by score (TD-MPC's code) or the "
-                        "Gaussian's mean", paper="mean", choices=("sampled", "mean"))
-    action_repeat: int = field(ACTION_REPEAT, "control steps a decision: the model file's own",
-                               repr=False)
-
-    def __post_init__(self):
-        super().__post_init__()
-        if self.horizon >= self.episode_steps:
-            self.refuse("horizon", f"below {self.episode_steps}, an episode's decisions")
-        if self.elites > self.samples:
-            self.refuse("elites", f"at most samples ({self.samples})")
-        if self.min_std > self.max_std:
-            self.refuse("min_std", f"at most max_std ({self.max_std})")
+    returns: str = field("fast", "Equation 2, plain or fast", choices=("fast", "plain"))
+    output: str = field("sampled", "an elite drawn by score (TD-MPC's code), or the mean",
+                        paper="mean", choices=("sampled", "mean"))
+    action_repeat: int = field(ACTION_REPEAT, "control steps a decision", repr=False)
 
     @property
     def episode_steps(self):
         """T: decisions in an episode."""
-        return episode_steps(self.action_repeat)
+        return CONTROL_STEPS // self.action_repeat
 
     @property
     def num_elites(self):
@@ -218,14 +124,11 @@ class DistillConfig(Settings):
     steps: int = field(14_000, "gradient steps (section 5.1: 10^5) [D1]", paper=100_000, least=1)
     batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=2)
     noise_samples: int = field(5, "K: perturbations of each action [D1]", paper=10, least=2)
-    noise_std: float = field(0.3, "deviation of the perturbations (authors' code: 0.5) [D9]",
-                             paper=0.5, plain=0.5, above=0)
-    targets: str = field("credit", "what Equation 4 compares: each agent's share with its part of "
-                         "the expert's prediction (credit), or sums of all shares (joint) [D9]",
-                         paper="joint", plain="joint", choices=("credit", "joint"))
-    policy_share: float = field(0.5, "share of states where what the expert's policy would do is "
-                                "perturbed, not what was done [D8]", paper=0.0, plain=0.0, least=0,
-                                most=1)
+    noise_std: float = field(0.3, "of the perturbations [D9]", paper=0.5, plain=0.5, above=0)
+    targets: str = field("credit", "a share learns its agent's part (credit), or all of them "
+                         "the sum [D9]", paper="joint", plain="joint", choices=("credit", "joint"))
+    policy_share: float = field(0.5, "share of states where the policy's actions are perturbed, "
+                                "not those done [D8]", paper=0.0, plain=0.0, least=0, most=1)
     clip_actions: bool = field(True, "clip perturbed actions to [-1, 1] [D7]", paper=False)
     reuse: int = field(4, "steps that learn from a state's perturbations [D1]", paper=1, least=1)
     horizon: int = field(3, "H of loss and planning (Table 2)", least=0, most=EPISODE_STEPS - 1)
@@ -234,96 +137,31 @@ class DistillConfig(Settings):
     value_coef: float = field(0.1, "weight of each Q's divergence (Table 2)", least=0)
     temperature_student: float = field(0.5, "T_s of Equation 4 (authors' code)", above=0)
     temperature_expert: float = field(0.5, "T_e (authors' code)", above=0)
-    kl: str = field("forward", "forward: D(expert || student); reverse: D(student || expert), "
-                    "Algorithm 1's order [D2]", paper="reverse", choices=("forward", "reverse"))
-    encoder_input: str = field("latent", "the student's encoder reads the expert's latent or the "
-                               "observation [D3]", paper="observation",
-                               choices=("latent", "observation"))
+    kl: str = field("forward", "D(expert || student), or reverse, Algorithm 1's order [D2]",
+                    paper="reverse", choices=("forward", "reverse"))
+    encoder_input: str = field("latent", "the encoder reads the expert's latent or the observation "
+                               "[D3]", paper="observation", choices=("latent", "observation"))
     lr: float = field(1e-3, "Adam's learning rate [D1]", paper=1e-4, above=0)
-    lr_schedule: str = field("cosine", "cosine (to zero) or constant [D1]", paper="constant",
-                             choices=("cosine", "constant"))
+    lr_schedule: str = field("cosine", "[D1]", paper="constant", choices=("cosine", "constant"))
     warmup: int = field(200, "steps over which lr rises from zero [D1]", paper=0, least=0)
     grad_clip: float = field(10.0, "largest gradient norm (Table 2)", above=0)
-    expert_episodes: int = field(96, "episodes that the expert's policy plays first, each with "
-                                 "noise of another deviation, up to 0.6 [D8]", paper=0, plain=0,
-                                 least=0)
-    played_share: float = field(0.5, "share of states from these [D8]; online: the student's own",
-                                paper=0.0, plain=0.0, least=0, most=1)
-    held_out: float = field(0.1, "about this share of episodes is held out, for rank correlations, "
-                            "others for each seed", least=1e-4, most=0.5)
-
-    def __post_init__(self):
-        super().__post_init__()
-        if self.expert_episodes and not self.played_share:
-            self.refuse("played_share", "above 0 where there are expert_episodes")
+    expert_episodes: int = field(96, "that its policy plays first [D8]", paper=0, plain=0, least=0)
+    played_share: float = field(0.5, "of states [D8]", paper=0.0, plain=0.0, least=0, most=1)
+    held_out: float = field(0.1, "share of episodes to measure ranks in", least=1e-4, most=0.5)
 
 
-# how a student plans, if its file says nothing else: around its expert's policy [D9]
-STUDENT_PLANNING = {"prior": "policy", "max_std": 0.25, "samples": 32, "iterations": 3,
-                    "output": "mean"}
-
-
-def seed_sequence(seed, **options):
-    """NumPy's SeedSequence of a seed; None: the system's own. UserError for what is none."""
-    try:
-        return np.random.SeedSequence(seed, **options)
-    except (TypeError, ValueError):
-        raise UserError(f"seed: expected a whole number of 0 or more, found {seed!r}") from None
+def student_config(theirs, num_agents, encoder_input, policy=False):
+    """A student's ModelConfig, from its expert's; policy: whether it keeps the expert's [D9]."""
+    below = {} if encoder_input == "observation" else {
+        "expert_latent_dim": theirs.num_agents * theirs.latent_dim,
+        "expert_enc_dim": theirs.enc_dim, "expert_mlp_dim": theirs.mlp_dim if policy else 0}
+    return ModelConfig(dim_obs=theirs.dim_obs, dim_action=theirs.dim_action, num_agents=num_agents,
+                       mlp_dim=max(512 // max(1, num_agents), 50), **below)
 
 
 def stream(seed, use, index=0):
     """The Generator of one use of a run's seed: no two uses, or indices of one, share numbers."""
     return np.random.default_rng(seed_sequence(seed, spawn_key=(zlib.crc32(use.encode()), index)))
-
-
-def divisors(n):
-    """The numbers of agents that can share n action dimensions."""
-    return [i for i in range(1, n + 1) if n % i == 0]
-
-
-def from_dict(config_class, values, where):
-    """A config from a dict, e.g. a file's header; unknown keys are refused, too."""
-    known = [f.name for f in dataclasses.fields(config_class)]
-    need(isinstance(values, dict), f"{where}: expected settings, found {values!r}")
-    for key in values:
-        need(key in known, f"{where}: unknown setting {key!r}; expected some of {', '.join(known)}")
-    try:
-        return config_class(**values)
-    except UserError as error:
-        raise UserError(f"{where}: {error}") from None
-
-
-def memory():
-    """Bytes of memory that this machine, or its container, has; infinite where neither tells."""
-    found = [np.inf]
-    with contextlib.suppress(AttributeError, OSError, ValueError):
-        found.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-        found.append(int(Path("/sys/fs/cgroup/memory.max").read_text()))
-    return min(found)
-
-
-LARGE = ("samples", "pi_trajs", "horizon", "batch_size", "noise_samples",
-         "expert_episodes", "buffer_size", "latent_dim", "enc_dim", "mlp_dim")  # memory's drivers
-
-
-def check_memory(numbers, *configs):
-    """UserError if so many float32 don't fit in memory, with the setting of the configs to lower:
-    the one that is the furthest above its default."""
-    _, name, value = max((getattr(config, f.name) / max(1, f.default), f.name,
-                          getattr(config, f.name)) for config in configs
-                         for f in dataclasses.fields(config) if f.name in LARGE)
-    need(4 * numbers <= memory(), f"{name} = {value}: it would take about {4e-9 * numbers:.1f} GB "
-         f"of memory, of {1e-9 * memory():.1f} GB here; lower it")
-
-
-def student_config(theirs, num_agents, encoder_input, policy=False):
-    """A student's ModelConfig, from its expert's: latents of 50, hidden max(512 // N, 50).
-    policy: whether it keeps the expert's, for `--plan-prior policy`."""
-    below = {} if encoder_input == "observation" else {
-        "expert_latent_dim": theirs.num_agents * theirs.latent_dim,
-        "expert_enc_dim": theirs.enc_dim, "expert_mlp_dim": theirs.mlp_dim if policy else 0}
-    return ModelConfig(theirs.dim_obs, theirs.dim_action, num_agents,
-                       50, 256, max(512 // max(1, num_agents), 50), **below)
 
 
 # ==== 2. Layers: each forward beside its backward =====================================
@@ -418,7 +256,8 @@ def forward(kinds, params, name, x, tape=None):
 def backward(kinds, params, name, tape, dy, grads):
     """Walk `forward` back: adds parameter gradients to `grads` (None: not wanted), returns dx.
 
-    Uses the tape up: activations are overwritten by gradients on the way."""
+    Uses the tape up: an activation's y, which only its own backward still reads, becomes its dx.
+    """
     for i in reversed(range(len(kinds))):
         kind, x, y = kinds[i], tape[i], tape[i + 1]
         if kind == "linear" and grads is None:
@@ -473,45 +312,16 @@ class Adam:
         self.gradient[:] = 0
         return length
 
-    def state(self):
-        """Everything that a resumed run needs."""
-        return {"weights": self.vector, "adam_m": self.m, "adam_v": self.v,
-                "step": np.int64(self.t)}
-
-    def load(self, state):
-        """Go on from a `state`."""
-        self.vector[:], self.m[:], self.v[:] = (state[k] for k in ("weights", "adam_m", "adam_v"))
-        self.t = int(state["step"])
-
-
-@functools.cache
-def _thread_pools():
-    from threadpoolctl import ThreadpoolController
-    return ThreadpoolController()
-
-
-@functools.cache
-def keep_memory():
-    """Free a large array, once: glibc then keeps smaller ones, whose page faults took 0.4 of a
-    plan's time. What plans or learns calls it first."""
-    np.empty(1 << 22, F32)
-
-
-def one_thread():
-    """A context in which BLAS uses one thread: more would change bits, and cores are for agents."""
-    return _thread_pools().limit(limits=1, user_api="blas")
-
 
 # ==== 3. World model (sections 3.2 and 4.2) ===========================================
 
 class WorldModel:
     """f_E, f_T, f_R, f_Q with an agent axis: TD-MPC for N = 1, Fac-TDMPC for N = A.
 
-    `params` maps official TD-MPC state-dict names to arrays with a leading agent axis, all of
-    one dtype (float32; float64 only to check gradients). The encoder is centralized (N = 1); only
-    experts have TD-MPC's policy, `_pi` (a of high Q). A student keeps what of its `expert` runs
-    once a decision, frozen: the encoder, for its latent is what the student's reads [D3], and the
-    policy with the dynamics that it is rolled out in, where there is one."""
+    `params` maps TD-MPC's state-dict names to arrays with a leading agent axis, of one dtype
+    (float32; float64 to check gradients). The encoder is centralized; only experts have TD-MPC's
+    policy, `_pi`. A student keeps of its `expert`, frozen, the encoder, whose latent its own reads
+    [D3], and the policy with the dynamics that it is rolled out in, around which it plans [D9]."""
 
     def __init__(self, config, params):
         self.config, self.params, self.expert = config, params, None
@@ -542,6 +352,11 @@ class WorldModel:
         z = forward(ENCODER, self.params, "_encoder", x, tape)
         return z.reshape(self.config.num_agents, self.config.latent_dim, -1)
 
+    def features(self, obs, z):
+        """What the trained encoder reads (1, F, B): observations (O, B), or the expert's latents z
+        of them (N, m, B) [D3]."""
+        return z.reshape(1, -1, z.shape[-1]) if self.config.expert_latent_dim else obs[None]
+
     def next(self, z, a):
         """s' = f_T(s, a).  z (N, m, B), a (N, d, B) -> (N, m, B)."""
         return forward(MLP, self.params, "_dynamics", np.concatenate([z, a], 1))
@@ -563,32 +378,6 @@ class WorldModel:
     def has_policy(self):
         return "_pi.0.weight" in self.params
 
-    def agents(self, i, j):
-        """The model of agents i..j-1 alone, without what all share; the whole if it's all."""
-        if j - i == self.config.num_agents:
-            return self
-        config = dataclasses.replace(self.config, num_agents=j - i, expert_latent_dim=0,
-                                     dim_action=(j - i) * self.config.agent_actions)
-        return WorldModel(config, {k: np.ascontiguousarray(v[i:j]) for k, v in self.params.items()
-                                   if k.startswith(("_dynamics", "_reward", "_Q"))})
-
-
-def policy_rollout(model, z, noise):
-    """Roll an expert's policy out in its model from z (1, m, B): actions (L, 1, A, B), each the
-    policy's plus its entry of `noise` (L of them), clipped to [-1, 1]."""
-    actions = []
-    for eps in noise:
-        z = model.next(z, actions[-1]) if actions else z
-        actions.append(np.clip(model.policy(z) + eps, -1, 1))
-    return np.stack(actions)
-
-
-def policy_plan(expert, z, steps, agents=1):
-    """What an expert's policy would do from z (1, m, B) on, rolled out in its model: each of so
-    many agents' part, (N, L, d, B)."""
-    actions = policy_rollout(expert, z, [F32(0)] * steps)
-    return actions.reshape(steps, agents, -1, z.shape[2]).swapaxes(0, 1)
-
 
 def networks(config, policy=False):
     """(name, layer kinds, agents, widths) of every network of a model."""
@@ -598,7 +387,6 @@ def networks(config, policy=False):
              ("_dynamics", MLP, n, (m + d, *hidden, m)),
              *((name, kinds, n, (m + d, *hidden, 1)) for name, kinds in HEADS)]
     if policy:
-        need(n == 1, f"a policy (_pi) needs one agent, found {n}: a plan's agents act alone")
         found.append(("_pi", MLP, n, (m, *hidden, d)))
     if latent:
         found.append(("_expert_encoder", ENCODER, 1,
@@ -619,20 +407,6 @@ def layers(config, policy=False):
                 before, *after = after
             elif kind == "norm":
                 yield name, i, kind, (agents, before, 1), False
-
-
-def learning_numbers(config, columns):
-    """About how many numbers Adam, gradients and tapes of a model hold for so many columns."""
-    return sum(agents * (6 * sum(a * b for a, b in zip(widths, widths[1:])) +
-                         3 * columns * sum(widths)) for *_, agents, widths in networks(config))
-
-
-def planning_numbers(sizes, config):
-    """About how many numbers a plan holds: action sequences, and the widest layers of a block."""
-    S, P = config.samples, config.pi_trajs
-    block = S if config.returns == "plain" else S // sample_blocks(sizes, S)
-    return (2 * (S + P) * (config.horizon + 1) * sizes.dim_action +
-            3 * (block + P) * sizes.num_agents * (sizes.latent_dim + 2 * sizes.mlp_dim))
 
 
 def unroll(model, z, actions, tapes=None):
@@ -667,10 +441,8 @@ def predict(model, z, actions):
 
 
 def heads_backward(model, tapes, d_shares, grads):
-    """Walk `run_heads` back: adds to `grads`, returns dx (N, m + d, L * B * K).
-
-    d_shares: gradients of the shares (N, L, B, K), or of a sum of agents' (fewer rows): each share
-    in a sum has the sum's gradient."""
+    """Walk `run_heads` back: adds to `grads`, returns dx (N, m + d, L * B * K). d_shares: gradients
+    of the shares (N, L, B, K), or of their sums (fewer rows), which each share in a sum has."""
     n, dx = model.config.num_agents, 0
     for (name, kinds), d in zip(HEADS, d_shares):
         d = np.repeat(d, n // len(d), 0).reshape(n, 1, -1)
@@ -689,7 +461,7 @@ def unroll_backward(model, tapes, actions, dx, grads):
     return dx[:, :m, :B * K].reshape(n, m, B, K).sum(3)
 
 
-# ==== 4. Model distillation (section 4.4, Algorithm 1, Equation 4) ====================
+# ==== 4. Model distillation (section 4.4) =============================================
 
 def log_softmax(x):
     """log of exp(x) / sum exp(x) over the last axis."""
@@ -773,27 +545,358 @@ def learning_rate(config, t):
     return float(rate)
 
 
-def perturbed_batch(expert, student, obs, actions, config, rng):
-    """Features (1, F, B), perturbed actions (L, A, B, K) and the expert's predictions for them, or
-    with `credit` what each agent did to these: then copy 0 is not perturbed.
-
-    obs (O, B); a_h (L, A, B, 1), or one a copy (L, A, B, K): a_h + eps_h may be clipped [D7]."""
+def perturbed_actions(actions, config, rng):
+    """a_h + eps_h (L, A, B, K) of actions (L, A, B, 1), or one a copy; clipped, if wanted [D7]."""
     noise = rng.standard_normal((*actions.shape[:3], config.noise_samples), F32)
-    tapes = defaultdict(list) if config.targets == "credit" else None
-    if tapes is not None:
-        noise[..., 0] = 0
     limit = 1 if config.clip_actions else np.inf
-    perturbed = np.clip(actions + F32(config.noise_std) * noise, -limit, limit)
-    z = expert.encode(obs)
-    features = z.reshape(1, -1, z.shape[-1]) if student.config.expert_latent_dim else obs[None]
-    x = unroll(expert, z, perturbed, tapes)
-    targets = [shares.sum(0) for shares in run_heads(expert, x, perturbed, tapes)]
-    if tapes is not None:
-        targets = credit(expert, tapes, perturbed, targets, student.config.num_agents)
-    return features, perturbed, targets
+    return np.clip(actions + F32(config.noise_std) * noise, -limit, limit)
 
 
-# ---- Added to the paper: what is perturbed, and what each joint did to a prediction.
+def perturbed_batch(expert, student, obs, actions, config, rng):
+    """What `distill_loss` learns from, of observations (O, B) and the actions (L, A, B, 1) done:
+    features (1, F, B), perturbed actions (L, A, B, K), the expert's predictions for them."""
+    perturbed, z = perturbed_actions(actions, config, rng), expert.encode(obs)
+    return student.features(obs, z), perturbed, predict(expert, z, perturbed)
+
+
+def distill(expert, replay, config, num_agents=None, seed=0):
+    """Algorithm 1: a factored student of an expert; yields it with each step's losses.
+
+    replay: the dataset; `starts` are rows that H + 1 actions follow, `sequences` g_0 and these.
+    `Distiller` is this loop with predictions that serve several steps [D1], more states [D8] and
+    credit [D9]."""
+    agents = expert.config.dim_action if num_agents is None else num_agents
+    sizes = student_config(expert.config, agents, config.encoder_input)
+    optimizer, student = new_student(expert, sizes, seed)
+    starts, _ = replay.starts(config.horizon + 1, config.held_out, seed)
+    for t in range(config.steps):                                                       # line 3
+        rng = stream(seed, f"pool {t}")
+        rows = rng.choice(starts, config.batch_size)
+        obs, actions = replay.sequences(rows, config.horizon + 1)                       # line 4
+        batch = perturbed_batch(expert, student, obs, actions[..., None], config, rng)
+        losses = distill_loss(student, *batch, config, optimizer.grads)                 # line 6
+        optimizer.step(learning_rate(config, t), config.grad_clip)                      # line 5
+        yield student, losses
+
+
+# ==== 5. Planning: MPPI (Equations 2 and 3) ===========================================
+
+def h_step_return(model, z, actions, config):
+    """Equation 2 for every agent as it reads; `Returns` computes the same faster.
+
+        G = sum_{h=0}^{H-1} gamma^h r(s_h, a_h) + gamma^H Q(s_H, a_H),   s_{h+1} = f_T(s_h, a_h)
+
+    z (N, m, 1), actions (N, H + 1, d, S) -> G_i (N, S). Q is the mean of the two: unlike TD-MPC's
+    minimum, a mean of sums is the sum of means, as Proposition 1 needs [D4]."""
+    gamma, G = config.discount, 0.0
+    z = np.repeat(z, actions.shape[-1], axis=2)
+    for h in range(config.horizon):
+        G = G + gamma ** h * model.reward(z, actions[:, h])
+        z = model.next(z, actions[:, h])
+    q1, q2 = model.q(z, actions[:, config.horizon])
+    return G + gamma ** config.horizon * (q1 + q2) / 2
+
+
+def mppi(returns, mean, config, rngs, proposals=None):
+    """MPPI: refine a Gaussian over action sequences by its elites, for each agent alone.
+
+    returns: actions (N, L, d, S) -> every G_i (N, S); mean (N, L, d): the first Gaussian's; rngs:
+    one Generator for each agent; proposals (N, L, d, P): sequences that compete in every iteration.
+    Elites are chosen agent by agent (Equation 3): a plan's G is sum_i G_i(a_i): the best of each is
+    the best of all (Proposition 1). N = 1 is centralized MPPI. Returns the new mean (N, L, d), the
+    last elites (N, L, d, E), scores (N, E) of sum 1 each, NaN where an agent has no finite G."""
+    mean, std, elites, scores = mean[..., None], F32(config.max_std), None, None
+    if proposals is not None:
+        G_proposals = returns(proposals)
+    for _ in range(config.iterations):
+        actions = np.stack([rng.standard_normal((*mean.shape[1:3], config.samples), F32)
+                            for rng in rngs])
+        actions *= std
+        actions += mean
+        np.clip(actions, -1, 1, out=actions)
+        G = returns(actions)
+        if proposals is not None:
+            actions = np.concatenate([actions, proposals], -1)
+            G = np.concatenate([G, G_proposals], 1)
+        G = np.where(np.isfinite(G), G, F32(-np.inf))  # these weigh nothing
+        best = np.argpartition(-G, config.num_elites - 1, axis=1)[:, :config.num_elites]
+        elites = np.take_along_axis(actions, best[:, None, None], 3)
+        G = np.take_along_axis(G, best, 1)
+        scores = np.exp(config.inverse_temperature * (G - G.max(1, keepdims=True)))
+        scores /= scores.sum(1, keepdims=True)
+        p = scores[:, None, None]
+        new = (p * elites).sum(3, keepdims=True)
+        std = np.sqrt((p * (elites - new) ** 2).sum(3, keepdims=True))
+        std = np.clip(std, config.min_std, config.max_std)
+        mean = config.momentum * mean + (1 - config.momentum) * new
+    return mean[..., 0], elites, scores
+
+
+def draw_elite(elites, scores, rngs):
+    """The first actions (N, d) of one elite of each agent, drawn by score (TD-MPC's code)."""
+    pick = [min(np.searchsorted(np.cumsum(p), rng.random(), "right"), len(p) - 1)
+            for p, rng in zip(scores, rngs)]
+    return np.stack([e[0, :, i] for e, i in zip(elites, pick)])
+
+
+def policy_noise(shape, rng):
+    """What TD-MPC adds to its policy's actions, where it learns and where it proposes."""
+    return np.clip(rng.standard_normal(shape, F32) * F32(0.05), -0.3, 0.3)
+
+
+def policy_rollout(model, z, noise):
+    """Roll an expert's policy out in its model from z (1, m, B): actions (L, 1, A, B), each the
+    policy's plus its entry of `noise` (L of them), clipped to [-1, 1]."""
+    actions = []
+    for eps in noise:
+        z = model.next(z, actions[-1]) if actions else z
+        actions.append(np.clip(model.policy(z) + eps, -1, 1))
+    return np.stack(actions)
+
+
+class AgentPlanner:
+    """Plans for all, some or one of a model's agents, from their latents: each agent's plan depends
+    on its own latent, model and stream alone. Part II has it faster, and in processes."""
+
+    def __init__(self, model, config):
+        self.model, self.config = model, config
+        self.forget()
+
+    def forget(self):
+        """Let the next plan start from a mean of zero, as an episode's first does."""
+        sizes = self.model.config
+        self.mean = np.zeros((sizes.num_agents, self.config.horizon + 1, sizes.agent_actions), F32)
+
+    def reset(self, seeds):
+        """Start an episode: `forget`, and draw from new streams, a SeedSequence for each agent."""
+        self.forget()
+        self.rngs = [np.random.Generator(np.random.SFC64(seed)) for seed in seeds]
+
+    def plan(self, z, prior=None):
+        """z (N, m, 1) -> first actions (N, d). The mean, moved on by one, starts the next plan,
+        unless this has a `prior` (N, L, d) [D9]."""
+        mean, elites, scores = self.search(z, self.mean if prior is None else prior)
+        self.mean = np.concatenate([mean[:, 1:], np.zeros_like(mean[:, :1])], 1)
+        if self.config.output == "mean" or not self.config.iterations:
+            return mean[:, 0]
+        return draw_elite(elites, scores, self.rngs)
+
+    def search(self, z, mean):
+        """MPPI from the latent z (N, m, 1) and a first mean (N, L, d), as `mppi` returns."""
+        return mppi(self.returns(z), mean, self.config, self.rngs, self.proposals(z))
+
+    def returns(self, z):
+        """What `mppi` asks: actions (N, L, d, S) -> G (N, S)."""
+        return functools.partial(h_step_return, self.model, z, config=self.config)
+
+    def proposals(self, z):
+        """Noisy policy rollouts (1, L, A, P), where there is a policy (TD-MPC's code)."""
+        P, L = self.config.pi_trajs, self.config.horizon + 1
+        if not (self.model.has_policy and P and self.config.iterations):
+            return None
+        noise = policy_noise((L, 1, self.model.config.dim_action, P), self.rngs[0])
+        return policy_rollout(self.model, np.repeat(z, P, 2), noise).swapaxes(0, 1)
+
+
+# ==== Part II: additions and engineering ==============================================
+#
+# A first reader is done: what follows is what this project adds to the paper, the same in less
+# time and in processes, and what a program needs around it.
+
+import argparse
+import contextlib
+import csv
+import difflib
+import importlib.metadata
+import itertools
+import json
+import math
+import multiprocessing
+import operator
+import os
+import pickle
+import signal
+import sys
+import tempfile
+import time
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from multiprocessing import resource_tracker
+from pathlib import Path
+
+__version__ = "0.1.0"  # to be raised where plans change: recorded returns name it
+DATA = Path(__file__).resolve().parent / "data"
+
+
+# ==== 6. Errors, and checks of settings where a user's values enter ===================
+
+class UserError(Exception):
+    """Something the user can mend: printed as one line, exit status 2."""
+
+
+def need(condition, message):
+    """UserError with this message unless the condition holds."""
+    if not condition:
+        raise UserError(message)
+
+
+def count(value, name, most=10 ** 9):
+    """The value, if it's a whole number from 0 to `most`; else UserError."""
+    need(isinstance(value, (int, np.integer)) and 0 <= value <= most,
+         f"{name}: expected a whole number from 0 to {most}, found {value!r}")
+    return value
+
+
+def check_finite(values, update, lr):
+    """UserError if learning diverged, before its weights are saved."""
+    for name, value in values.items():
+        need(np.isfinite(value).all(), f"after update {update} the {name} no longer finite: "
+             f"learning diverged; lower the learning rate ({lr})")
+
+
+def divisors(n):
+    """The numbers of agents that can share n action dimensions."""
+    return [i for i in range(1, n + 1) if n % i == 0]
+
+
+def episode_steps(action_repeat):
+    """T for this many control steps a decision; UserError if an episode doesn't divide by it."""
+    need(action_repeat in divisors(CONTROL_STEPS), f"action_repeat: expected a divisor of "
+         f"{CONTROL_STEPS}, an episode's control steps, found {action_repeat!r}")
+    return CONTROL_STEPS // action_repeat
+
+
+def seed_sequence(seed, **options):
+    """NumPy's SeedSequence of a seed; None: the system's own. UserError for what is none."""
+    try:
+        return np.random.SeedSequence(seed, **options)
+    except (TypeError, ValueError):
+        raise UserError(f"seed: expected a whole number of 0 or more, found {seed!r}") from None
+
+
+RANGE = {"least": ("at least {}", operator.ge), "above": ("above {}", operator.gt),
+         "most": ("at most {}", operator.le),
+         "choices": ("one of {}", lambda value, choices: value in choices)}
+
+
+def check_settings(config):
+    """UserError for a type or a value that a config's field rules out, and for two that don't go
+    together. 1 becomes 1.0 where a float is meant, and NumPy's numbers Python's."""
+    for f in dataclasses.fields(config):
+        value, cls = getattr(config, f.name), type(f.default)
+        if np.dtype(type(value)).kind not in {int: "iu", float: "iuf", bool: "b"}.get(cls, "U"):
+            refuse(config, f.name, f"of type {cls.__name__}")
+        rules = [(words.format(f.metadata[bound]), holds(value, f.metadata[bound]))
+                 for bound, (words, holds) in RANGE.items() if bound in f.metadata]
+        if cls is float:
+            rules.append(("finite, as a float32", abs(value) < 3e38))
+        elif cls is int and value > 10 ** 9:
+            rules.append(("at most 10^9", False))
+        if not all(holds for _, holds in rules):
+            refuse(config, f.name, " and ".join(words for words, _ in rules))
+        object.__setattr__(config, f.name, cls(value))
+    check_together = TOGETHER.get(type(config))
+    for name, holds, rule in check_together(config) if check_together else ():
+        if not holds:
+            refuse(config, name, rule)
+
+
+def refuse(config, name, rule):
+    """UserError for the value of a config's field `name`."""
+    raise UserError(f"{type(config).__name__}: {name} must be {rule}, not "
+                    f"{getattr(config, name)!r}")
+
+
+def _model_rules(config):
+    agents = divisors(config.dim_action)
+    yield ("num_agents", config.num_agents in agents,
+           f"one of {agents}, as {config.dim_action} action dimensions are shared evenly")
+
+
+def _planner_rules(config):
+    T = episode_steps(config.action_repeat)
+    yield "horizon", config.horizon < T, f"below {T}, an episode's decisions"
+    yield "elites", config.elites <= config.samples, f"at most samples ({config.samples})"
+    yield "min_std", config.min_std <= config.max_std, f"at most max_std ({config.max_std})"
+
+
+def _distill_rules(config):
+    yield ("played_share", config.played_share or not config.expert_episodes,
+           "above 0 where there are expert_episodes")
+
+
+TOGETHER = {ModelConfig: _model_rules, PlannerConfig: _planner_rules, DistillConfig: _distill_rules}
+
+
+def from_dict(config_class, values, where):
+    """A config from a dict, e.g. a file's header; unknown keys are refused, too."""
+    known = [f.name for f in dataclasses.fields(config_class)]
+    need(isinstance(values, dict), f"{where}: expected settings, found {values!r}")
+    for key in values:
+        need(key in known, f"{where}: unknown setting {key!r}; expected some of {', '.join(known)}")
+    try:
+        return config_class(**values)
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from None
+
+
+def memory():
+    """Bytes of memory that this machine, or its container, has; infinite where neither tells."""
+    found = [np.inf]
+    with contextlib.suppress(AttributeError, OSError, ValueError):
+        found.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+        found.append(int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    return min(found)
+
+
+LARGE = ("samples", "pi_trajs", "horizon", "batch_size", "noise_samples",
+         "expert_episodes", "buffer_size", "latent_dim", "enc_dim", "mlp_dim")  # memory's drivers
+
+
+def check_memory(numbers, *configs):
+    """UserError if so many float32 don't fit in memory, with the setting of the configs to lower:
+    the one that is the furthest above its default."""
+    _, name, value = max((getattr(config, f.name) / max(1, f.default), f.name,
+                          getattr(config, f.name)) for config in configs
+                         for f in dataclasses.fields(config) if f.name in LARGE)
+    need(4 * numbers <= memory(), f"{name} = {value}: it would take about {4e-9 * numbers:.1f} GB "
+         f"of memory, of {1e-9 * memory():.1f} GB here; lower it")
+
+
+def learning_numbers(config, columns):
+    """About how many numbers Adam, gradients and tapes of a model hold for so many columns."""
+    return sum(agents * (6 * sum(a * b for a, b in zip(widths, widths[1:])) +
+                         3 * columns * sum(widths)) for *_, agents, widths in networks(config))
+
+
+def planning_numbers(sizes, config):
+    """About how many numbers a plan holds: action sequences, and the widest layers of a block."""
+    S, P = config.samples, config.pi_trajs
+    block = S if config.returns == "plain" else S // sample_blocks(sizes, S)
+    return (2 * (S + P) * (config.horizon + 1) * sizes.dim_action +
+            3 * (block + P) * sizes.num_agents * (sizes.latent_dim + 2 * sizes.mlp_dim))
+
+
+# ==== 7. Added to the paper: more states [D8], credit, a search around the policy [D9] =
+
+# how a student plans that was taught around its expert's policy, if its file says nothing else
+STUDENT_PLANNING = {"prior": "policy", "max_std": 0.25, "samples": 32, "iterations": 3,
+                    "output": "mean"}
+
+
+def student_planning(config):
+    """Settings of a PlannerConfig that students distilled with this config plan with [D9]: around
+    the expert's policy, where they were taught around it; else as any model."""
+    return STUDENT_PLANNING if config.policy_share else {}
+
+
+def policy_plan(expert, z, steps, agents=1):
+    """What an expert's policy would do from z (1, m, B) on, rolled out in its model: each of so
+    many agents' part, (N, L, d, B)."""
+    actions = policy_rollout(expert, z, [F32(0)] * steps)
+    return actions.reshape(steps, agents, -1, z.shape[2]).swapaxes(0, 1)
+
 
 def around_policy(expert, obs, actions, share, rng):
     """Actions (L, A, B) to perturb in states obs (O, B): for a share of these what the expert's
@@ -840,6 +943,101 @@ def credit(expert, tapes, actions, predicted, agents):
     return [parts[:, 0], parts[:, 1], parts[:, 1]]
 
 
+def credited_batch(expert, student, obs, actions, config, rng):
+    """`perturbed_batch` with each agent's part of the expert's predictions; copy 0 is what
+    `actions` say."""
+    perturbed, tapes, z = perturbed_actions(actions, config, rng), defaultdict(list), expert.encode(
+        obs)
+    perturbed[..., :1] = actions[..., :1]
+    x = unroll(expert, z, perturbed, tapes)
+    predicted = [shares.sum(0) for shares in run_heads(expert, x, perturbed, tapes)]
+    return student.features(obs, z), perturbed, credit(expert, tapes, perturbed, predicted,
+                                                       student.config.num_agents)
+
+
+def taught_batch(expert, student, obs, actions, config, rng):
+    """`perturbed_batch` or `credited_batch`, by the config's `targets`."""
+    batch = credited_batch if config.targets == "credit" else perturbed_batch
+    return batch(expert, student, obs, actions, config, rng)
+
+
+def teacher_of(model, config):
+    """The expert whose policy plans begin from: a student's, or the model itself. UserError: it has
+    none, and the config wants one."""
+    teacher = model.expert or model
+    need(config.prior == "none" or teacher.has_policy, "the model holds no policy of an expert for "
+         "plans to begin from, since the expert has none or the student's encoder reads the "
+         "observation; pass --plan-prior none (evaluate: --prior none)")
+    return teacher
+
+
+WIDTHS = 0.05, 0.1, 0.15, 0.25, 0.4, 0.6  # deviations that a search around the policy may have
+
+
+def plan_gains(expert, model, config, obs, seed=0):
+    """What plans of the expert or a student, `model`, are worth above what the expert's policy
+    would do, in states obs (O, S): by the expert's own G, and by the model's (what they promise),
+    two (S,)."""
+    with one_thread():
+        z, own, planner = expert.encode(obs), model.encode(obs), FastPlanner(model, config)
+        policy, plans = policy_plan(expert, z, config.horizon + 1, len(own)), []
+        first = policy * F32(config.prior == "policy")
+        for i, seeds in enumerate(seed_sequence(seed).spawn(obs.shape[1])):
+            planner.reset(seeds.spawn(len(own)))
+            plans.append(planner.search(own[:, :, i:i + 1], first[..., i])[0])
+        both = np.stack([np.stack(plans, -1), policy], -1).swapaxes(0, 1)  # (L, N, d, S, 2)
+        both = both.reshape(len(both), -1, *both.shape[3:])
+        G = [horizon_returns(*predict(*of, both), config.discount)[-1]
+             for of in ((expert, z), (model, own))]
+    return [g[:, 0] - g[:, 1] for g in G]
+
+
+def search_width(distiller, config, states=128):
+    """The smallest deviation of WIDTHS with which a student's search gains, by the expert's G in
+    held-out states, no less than the best one less its standard error; and of each [width, mean
+    gain, its standard error, mean promise] [D9]."""
+    starts = stream(distiller.seed, "search width").choice(distiller.held_out_starts, states)
+    (obs, _), rows = distiller.replay.sequences(starts, 1), []
+    for width in WIDTHS:
+        gain, promise = plan_gains(distiller.expert, distiller.student, dataclasses.replace(
+            config, max_std=width, min_std=min(width, config.min_std)), obs, distiller.seed)
+        rows.append([width, *map(float, (gain.mean(), gain.std(ddof=1) / np.sqrt(states),
+                                         promise.mean()))])
+    _, gain, error, _ = max(rows, key=lambda row: row[1])
+    return next(row[0] for row in rows if row[1] >= gain - error), rows
+
+
+# ==== 8. The same, in less time =======================================================
+
+def optimizer_state(adam):
+    """Everything of an Adam that a resumed run needs."""
+    return {"weights": adam.vector, "adam_m": adam.m, "adam_v": adam.v, "step": np.int64(adam.t)}
+
+
+def load_optimizer(adam, state):
+    """Go on from an `optimizer_state`."""
+    adam.vector[:], adam.m[:], adam.v[:] = (state[k] for k in ("weights", "adam_m", "adam_v"))
+    adam.t = int(state["step"])
+
+
+@functools.cache
+def _thread_pools():
+    from threadpoolctl import ThreadpoolController
+    return ThreadpoolController()
+
+
+@functools.cache
+def keep_memory():
+    """Free a large array, once: glibc then keeps smaller ones, whose page faults took 0.4 of a
+    plan's time. What plans or learns calls it first."""
+    np.empty(1 << 22, F32)
+
+
+def one_thread():
+    """A context in which BLAS uses one thread: more would change bits, and cores are for agents."""
+    return _thread_pools().limit(limits=1, user_api="blas")
+
+
 POOL, PART = 4096, 64  # states that the expert predicts at once, and a thread's part of them
 EXPERT_NOISE = 0.6  # largest deviation of the noise in episodes that its policy plays [D8]
 
@@ -851,7 +1049,7 @@ class Distiller:
     computed once and learned from `reuse` times; by two threads: NumPy's products hold no GIL.
     sizes: replace `student_config`'s. UserError if expert, replay and config don't fit."""
 
-    loss, perturb = staticmethod(distill_loss), staticmethod(perturbed_batch)  # or a subclass's own
+    loss, perturb = staticmethod(distill_loss), staticmethod(taught_batch)  # or a subclass's own
 
     def __init__(self, expert, replay, config, num_agents=None, seed=0, **sizes):
         keep_memory()
@@ -890,14 +1088,15 @@ class Distiller:
         """Lines 4 and 6 (expert), `size` states, part `part` of a pool; as `perturb` returns."""
         rng, L = stream(self.seed, f"pool {number}", part), self.config.horizon + 1
         obs, actions = self.replay.sequences(rng.choice(self.train_starts, size), L)
-        is_played = rng.random(size) < (self.config.played_share if len(self.played) else 0)
-        if count := is_played.sum():
+        is_played = len(self.played) and rng.random(size) < self.config.played_share
+        if count := np.sum(is_played):
             episode = rng.integers(len(self.played), size=count)
             t = rng.integers(self.played.shape[1] - L + 1, size=count) + np.arange(L)[:, None]
             seen, done = np.split(self.played[episode, t].swapaxes(1, 2).astype(F32),
                                   [self.replay.dim_obs], 1)
             obs[:, is_played], actions[:, :, is_played] = seen[0], done  # seen (L, O, count)
-        actions = around_policy(self.expert, obs, actions, self.config.policy_share, rng)
+        if self.config.policy_share:
+            actions = around_policy(self.expert, obs, actions, self.config.policy_share, rng)
         return self.perturb(self.expert, self.student, obs, actions[..., None], self.config, rng)
 
     def batch(self, t):
@@ -962,17 +1161,40 @@ class Distiller:
 
     def state(self):
         """Everything that a resumed run needs."""
-        return {**self.optimizer.state(), "played": self.played}
+        return {**optimizer_state(self.optimizer), "played": self.played}
 
     def load(self, state):
         """Go on from a `state`."""
-        self.optimizer.load(state)
+        load_optimizer(self.optimizer, state)
         shape = *state["played"].shape[:2], self.played.shape[2]  # or it is another robot's
         self.played, self._number = state["played"].reshape(shape), None
 
     def close(self):
         """Stop the threads."""
         self._threads.shutdown(wait=True, cancel_futures=True)
+
+
+class PlainDistiller(Distiller):
+    """Part I's `distill` in a Distiller's place, for `distill --plain`."""
+
+    def load(self, state):
+        """A state of the end; one that was cut off starts anew."""
+        if state["step"] == self.config.steps:
+            super().load(state)
+
+    def run(self):
+        """Yields each step's losses, as Distiller.run does."""
+        steps = () if self.t else distill(self.expert, self.replay, self.config,
+                                          self.student.config.num_agents, self.seed)
+        for student, losses in steps:
+            for key, value in self.optimizer.params.items():
+                value[:] = student.params[key]
+            self.optimizer.t += 1
+            check_finite({"loss is": losses}, self.t, self.config.lr)
+            yield losses
+
+
+# ---- How alike student and expert rank actions.
 
 
 def spearman(x, y):
@@ -985,8 +1207,11 @@ def spearman(x, y):
 
 def horizon_returns(rewards, q1, q2, discount):
     """Equation 2 for H = 0, 1, ... at once, (L, B, K), from `predict`'s global rewards and Q."""
-    gamma = (discount ** np.arange(len(rewards))).astype(rewards.dtype)[:, None, None]
-    return np.cumsum(gamma * rewards, 0) - gamma * rewards + gamma * (q1 + q2) / 2  # h < H; Q at H
+    rewarded, found = 0.0, []
+    for h, (reward, q) in enumerate(zip(rewards, (q1 + q2) / 2)):
+        found.append(rewarded + discount ** h * q)
+        rewarded = rewarded + discount ** h * reward
+    return np.stack(found)
 
 
 def rank_by_state(distiller, rows, discount, rng):
@@ -1038,224 +1263,7 @@ def rank_results(distiller, states, discount):
             "rank_correlation_episodes": len(np.unique(episodes))}
 
 
-# ==== 5. Planning: MPPI (Equations 2 and 3), then the worker processes ================
-
-def h_step_return(model, z, actions, config):
-    """Equation 2 for every agent as it reads; `Returns` computes the same faster.
-
-        G = sum_{h=0}^{H-1} gamma^h r(s_h, a_h) + gamma^H Q(s_H, a_H),   s_{h+1} = f_T(s_h, a_h)
-
-    z (N, m, 1), actions (N, H + 1, d, S) -> G_i (N, S). Q is the mean of the two: unlike TD-MPC's
-    minimum, a mean of sums is the sum of means, as Proposition 1 needs [D4]."""
-    gamma, G = config.discount, 0.0
-    z = np.repeat(z, actions.shape[-1], axis=2)
-    for h in range(config.horizon):
-        G = G + gamma ** h * model.reward(z, actions[:, h])
-        z = model.next(z, actions[:, h])
-    q1, q2 = model.q(z, actions[:, config.horizon])
-    return G + gamma ** config.horizon * (q1 + q2) / 2
-
-
-def mppi(returns, mean, config, rngs, proposals=None):
-    """MPPI: refine a Gaussian over action sequences by its elites, for each agent alone.
-
-    returns: actions (N, L, d, S) -> every G_i (N, S); mean (N, L, d): the first Gaussian's; rngs:
-    one Generator for each agent; proposals (N, L, d, P): sequences that compete in every iteration.
-    Elites are chosen agent by agent (Equation 3): a plan's G is sum_i G_i(a_i): the best of each is
-    the best of all (Proposition 1). N = 1 is centralized MPPI. Returns the new mean (N, L, d), the
-    last elites (N, L, d, E), scores (N, E) of sum 1 each. UserError: an agent has no finite G."""
-    mean, std, elites, scores = mean[..., None], F32(config.max_std), None, None
-    if proposals is not None:
-        G_proposals = returns(proposals)
-    for _ in range(config.iterations):
-        actions = np.stack([rng.standard_normal((*mean.shape[1:3], config.samples), F32)
-                            for rng in rngs])
-        actions *= std
-        actions += mean
-        np.clip(actions, -1, 1, out=actions)
-        G = returns(actions)
-        if proposals is not None:
-            actions = np.concatenate([actions, proposals], -1)
-            G = np.concatenate([G, G_proposals], 1)
-        G = np.where(np.isfinite(G), G, F32(-np.inf))  # these weigh nothing
-        need(np.isfinite(G.max(1)).all(), "planning: no action sequence has a finite return; the "
-             "model's weights or the observation are far out of range")
-        best = np.argpartition(-G, config.num_elites - 1, axis=1)[:, :config.num_elites]
-        elites = np.take_along_axis(actions, best[:, None, None], 3)
-        G = np.take_along_axis(G, best, 1)
-        scores = np.exp(config.inverse_temperature * (G - G.max(1, keepdims=True)))
-        scores /= scores.sum(1, keepdims=True)
-        p = scores[:, None, None]
-        new = (p * elites).sum(3, keepdims=True)
-        std = np.sqrt((p * (elites - new) ** 2).sum(3, keepdims=True))
-        std = np.clip(std, config.min_std, config.max_std)
-        mean = config.momentum * mean + (1 - config.momentum) * new
-    return mean[..., 0], elites, scores
-
-
-def draw_elite(elites, scores, rngs):
-    """The first actions (N, d) of one elite of each agent, drawn by score (TD-MPC's code)."""
-    pick = [min(np.searchsorted(np.cumsum(p), rng.random(), "right"), len(p) - 1)
-            for p, rng in zip(scores, rngs)]
-    return np.stack([e[0, :, i] for e, i in zip(elites, pick)])
-
-
-POLICY_STD, POLICY_CUT = 0.05, 0.3  # TD-MPC's policy noise: its deviation, and where it is cut
-
-
-def policy_noise(shape, rng):
-    """What TD-MPC adds to its policy's actions, where it learns and where it proposes."""
-    return np.clip(rng.standard_normal(shape, F32) * F32(POLICY_STD), -POLICY_CUT, POLICY_CUT)
-
-
-class AgentPlanner:
-    """Plans for all, some or one of a model's agents."""
-
-    def __init__(self, model, config):
-        keep_memory()
-        self.model, self.config = model, config
-        self.fast = None if config.returns == "plain" else Returns(model)
-        self.reset([])
-
-    def reset(self, seeds):
-        """Forget the last plan's mean; seeds: one SeedSequence an agent, [] to keep the streams."""
-        sizes = self.model.config
-        self.mean = np.zeros((sizes.num_agents, self.config.horizon + 1, sizes.agent_actions), F32)
-        if len(seeds):
-            self.rngs = [np.random.Generator(np.random.SFC64(s)) for s in seeds]
-
-    def plan(self, z, prior=None):
-        """z (N, m, 1) -> first actions (N, d). The mean, moved on by one, starts the next plan,
-        unless this has a `prior` (N, L, d)."""
-        mean, elites, scores = self.search(z, self.mean if prior is None else prior)
-        self.mean = np.concatenate([mean[:, 1:], np.zeros_like(mean[:, :1])], 1)
-        if self.config.output == "mean" or not self.config.iterations:
-            return mean[:, 0]
-        return draw_elite(elites, scores, self.rngs)
-
-    def search(self, z, mean):
-        """MPPI from the latent z (N, m, 1) and a first mean (N, L, d), as `mppi` returns."""
-        returns = (self.fast.start(z, self.config) if self.fast else
-                   functools.partial(h_step_return, self.model, z, config=self.config))
-        return mppi(returns, mean, self.config, self.rngs, self._proposals(z))
-
-    def _proposals(self, z):
-        """Noisy policy rollouts (1, L, A, P), where there is a policy (TD-MPC's code)."""
-        P, L = self.config.pi_trajs, self.config.horizon + 1
-        if not (self.model.has_policy and P and self.config.iterations):
-            return None
-        noise = policy_noise((L, 1, self.model.config.dim_action, P), self.rngs[0])
-        return policy_rollout(self.model, np.repeat(z, P, 2), noise).swapaxes(0, 1)
-
-
-def teacher_of(model, config):
-    """The expert whose policy plans begin from: a student's, or the model itself. UserError: it has
-    none, and the config wants one."""
-    teacher = model.expert or model
-    need(config.prior == "none" or teacher.has_policy, "the model holds no policy of an expert for "
-         "plans to begin from, since the expert has none or the student's encoder reads the "
-         "observation; pass --plan-prior none (evaluate: --prior none)")
-    return teacher
-
-
-class Planner(contextlib.ExitStack):  # whose `close` ends the workers
-    """Observation in, action out; an episode's next plan starts from the last one's mean.
-
-        with Planner(model, PlannerConfig(), seed=0, workers=1) as planner:
-            action = planner.act(obs)      # (O,) -> (A,) in [-1, 1]
-
-    workers: processes beside this one, each for a part of the agents (0: all here). They import the
-    file that makes the planner, which needs `if __name__ == "__main__":`. Every agent owns its
-    random stream and one BLAS thread computes each product, so the plan is the same, bit for bit,
-    for every number of workers. Raises UserError for too many, WorkerError when one has died. Some
-    weights are copied: make a new planner when they have changed."""
-
-    def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
-        self.model, self.config, sequence = model, config, seed_sequence(seed)
-        self._teacher = teacher_of(model, config)
-        check_memory(planning_numbers(model.config, config), config, model.config)
-        self._parts = split_agents(model.config.num_agents, workers)
-        own, *others = ((model.agents(part.start, part.stop), config) for part in self._parts)
-        self.own = AgentPlanner(*own)
-        super().__init__()
-        self._workers = self.enter_context(Workers(_planning_worker, workers, "planning worker"))
-        self._workers.send_all(others)
-        self._workers.receive_all()  # they are ready: no decision waits for their start
-        self.reset(sequence.entropy)
-
-    def reset(self, seed=None):
-        """Start an episode: forget the last plan's mean; a seed also starts the streams anew."""
-        n = self.model.config.num_agents
-        seeds = [] if seed is None else seed_sequence(seed).spawn(n)
-        self._workers.send_all(seeds[part] for part in self._parts[1:])
-        self.own.reset(seeds[self._parts[0]])
-
-    def act(self, obs):
-        """obs (O,) -> action (A,), float32 in [-1, 1]. UserError: other shape, NaN, no finite G."""
-        shape = (self.model.config.dim_obs,)
-        try:
-            obs = np.asarray(obs, F32)
-        except (TypeError, ValueError):
-            raise UserError(f"observation: expected numbers of shape {shape}, found what NumPy "
-                            "makes no array of them of") from None
-        need(obs.shape == shape, f"observation: expected shape {shape}, found {obs.shape}")
-        need(np.isfinite(obs).all(), "observation: holds values that are not finite")
-        with one_thread():
-            z, prior = self.model.encode(obs[:, None]), self._prior(obs)
-            tasks = [(z[part], prior if prior is None else prior[part]) for part in self._parts]
-            try:
-                self._workers.send_all(tasks[1:])
-                plans = [self.own.plan(*tasks[0]), *self._workers.receive_all()]
-            except BaseException:  # answers left unread would be the next decision's
-                self.close()
-                raise
-        return np.concatenate(plans).reshape(-1)
-
-    def _prior(self, obs):
-        """The expert's policy from obs (O,) on, rolled out in its model: (N, L, d), or None."""
-        if self.config.prior == "none":
-            return None
-        return policy_plan(self._teacher, self._teacher.encode(obs[:, None]),
-                           self.config.horizon + 1, self.model.config.num_agents)[..., 0]
-
-
-WIDTHS = 0.05, 0.1, 0.15, 0.25, 0.4, 0.6  # deviations that a search around the policy may have
-
-
-def plan_gains(expert, model, config, obs, seed=0):
-    """What plans of the expert or a student, `model`, are worth above what the expert's policy
-    would do, in states obs (O, S): by the expert's own G, and by the model's (what they promise),
-    two (S,)."""
-    with one_thread():
-        z, own, planner = expert.encode(obs), model.encode(obs), AgentPlanner(model, config)
-        policy, plans = policy_plan(expert, z, config.horizon + 1, len(own)), []
-        first = policy * F32(config.prior == "policy")
-        for i, seeds in enumerate(seed_sequence(seed).spawn(obs.shape[1])):
-            planner.reset(seeds.spawn(len(own)))
-            plans.append(planner.search(own[:, :, i:i + 1], first[..., i])[0])
-        both = np.stack([np.stack(plans, -1), policy], -1).swapaxes(0, 1)  # (L, N, d, S, 2)
-        both = both.reshape(len(both), -1, *both.shape[3:])
-        G = [horizon_returns(*predict(*of, both), config.discount)[-1]
-             for of in ((expert, z), (model, own))]
-    return [g[:, 0] - g[:, 1] for g in G]
-
-
-def search_width(distiller, config, states=128):
-    """The smallest deviation of WIDTHS with which a student's search gains, by the expert's G in
-    held-out states, no less than the best one less its standard error; and of each [width, mean
-    gain, its standard error, mean promise] [D9]."""
-    starts = stream(distiller.seed, "search width").choice(distiller.held_out_starts, states)
-    (obs, _), rows = distiller.replay.sequences(starts, 1), []
-    for width in WIDTHS:
-        gain, promise = plan_gains(distiller.expert, distiller.student, dataclasses.replace(
-            config, max_std=width, min_std=min(width, config.min_std)), obs, distiller.seed)
-        rows.append([width, *map(float, (gain.mean(), gain.std(ddof=1) / np.sqrt(states),
-                                         promise.mean()))])
-    _, gain, error, _ = max(rows, key=lambda row: row[1])
-    return next(row[0] for row in rows if row[1] >= gain - error), rows
-
-
-# ---- The same, fast: a first reading skips this. `Returns` computes h_step_return.
+# ---- Plans: `Returns` computes h_step_return.
 
 
 def homogeneous(params, layer):
@@ -1361,7 +1369,43 @@ def sample_blocks(sizes, samples):
     return max(1, round(samples / (256 if sizes.mlp_dim >= 256 else 128)))
 
 
-# ---- The same, in processes: workers plan for a part of the agents each.
+class FastPlanner(AgentPlanner):
+    """`AgentPlanner` with `Returns`, unless its config says plain; UserError: no finite G."""
+
+    def __init__(self, model, config):
+        keep_memory()
+        super().__init__(model, config)
+        self.fast = None if config.returns == "plain" else Returns(model)
+
+    def reset(self, seeds):
+        """An episode's start; without seeds the streams go on."""
+        if seeds:
+            super().reset(seeds)
+        else:
+            self.forget()
+
+    def returns(self, z):
+        return self.fast.start(z, self.config) if self.fast else super().returns(z)
+
+    def search(self, z, mean):
+        with np.errstate(invalid="ignore"):
+            mean, elites, scores = super().search(z, mean)
+        need(scores is None or np.isfinite(scores).all(), "planning: no action sequence has a "
+             "finite return; the model's weights or the observation are far out of range")
+        return mean, elites, scores
+
+
+# ==== 9. The same, in processes: workers plan for a part of the agents each ============
+
+def some_agents(model, i, j):
+    """The model of agents i..j-1 alone, without what all share; the whole if it's all."""
+    sizes = model.config
+    if j - i == sizes.num_agents:
+        return model
+    config = dataclasses.replace(sizes, num_agents=j - i, expert_latent_dim=0,
+                                 dim_action=(j - i) * sizes.agent_actions)
+    return WorldModel(config, {k: np.ascontiguousarray(v[i:j]) for k, v in model.params.items()
+                               if k.startswith(("_dynamics", "_reward", "_Q"))})
 
 
 def split_agents(agents, workers):
@@ -1381,9 +1425,71 @@ def useful_workers(agents):
     return min(agents, cores()) - 1
 
 
+class Planner(contextlib.ExitStack):  # whose `close` ends the workers
+    """Observation in, action out; an episode's next plan starts from the last one's mean.
+
+        with Planner(model, PlannerConfig(), seed=0, workers=1) as planner:
+            action = planner.act(obs)      # (O,) -> (A,) in [-1, 1]
+
+    workers: processes beside this one, each for a part of the agents (0: all here). They import the
+    file that makes the planner, which needs `if __name__ == "__main__":`. Every agent owns its
+    random stream and one BLAS thread computes each product, so the plan is the same, bit for bit,
+    for every number of workers. Raises UserError for too many, WorkerError when one has died. Some
+    weights are copied: make a new planner when they have changed."""
+
+    def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
+        self.model, self.config, sequence = model, config, seed_sequence(seed)
+        self._teacher = teacher_of(model, config)
+        check_memory(planning_numbers(model.config, config), config, model.config)
+        self._parts = split_agents(model.config.num_agents, workers)
+        own, *others = ((some_agents(model, part.start, part.stop), config)
+                        for part in self._parts)
+        self.own = FastPlanner(*own)
+        super().__init__()
+        self._workers = self.enter_context(Workers(_planning_worker, workers, "planning worker"))
+        self._workers.send_all(others)
+        self._workers.receive_all()  # they are ready: no decision waits for their start
+        self.reset(sequence.entropy)
+
+    def reset(self, seed=None):
+        """Start an episode: forget the last plan's mean; a seed also starts the streams anew."""
+        n = self.model.config.num_agents
+        seeds = [] if seed is None else seed_sequence(seed).spawn(n)
+        self._workers.send_all(seeds[part] for part in self._parts[1:])
+        self.own.reset(seeds[self._parts[0]])
+
+    def act(self, obs):
+        """obs (O,) -> action (A,), float32 in [-1, 1]. UserError: other shape, NaN, no finite G."""
+        shape = (self.model.config.dim_obs,)
+        try:
+            obs = np.asarray(obs, F32)
+        except (TypeError, ValueError):
+            raise UserError(f"observation: expected numbers of shape {shape}, found what NumPy "
+                            "makes no array of them of") from None
+        need(obs.shape == shape, f"observation: expected shape {shape}, found {obs.shape}")
+        need(np.isfinite(obs).all(), "observation: holds values that are not finite")
+        with one_thread():
+            z, prior = self.model.encode(obs[:, None]), self._prior(obs)
+            tasks = [(z[part], prior if prior is None else prior[part]) for part in self._parts]
+            try:
+                self._workers.send_all(tasks[1:])
+                plans = [self.own.plan(*tasks[0]), *self._workers.receive_all()]
+            except BaseException:  # answers left unread would be the next decision's
+                self.close()
+                raise
+        return np.concatenate(plans).reshape(-1)
+
+    def _prior(self, obs):
+        """The expert's policy from obs (O,) on, rolled out in its model: (N, L, d), or None."""
+        if self.config.prior == "none":
+            return None
+        return policy_plan(self._teacher, self._teacher.encode(obs[:, None]),
+                           self.config.horizon + 1, self.model.config.num_agents)[..., 0]
+
+
 def _planning_worker(connection):
     """Plans for its part of the agents: latents in, actions out; a list is `reset`'s seeds."""
-    planner = AgentPlanner(*connection.recv())
+    planner = FastPlanner(*connection.recv())
     connection.send("ready")
     while True:
         message = connection.recv()
@@ -1472,7 +1578,7 @@ def _run_worker(target, connection):
             connection.send(UserError(str(error) or "not enough memory"))
 
 
-# ==== 6. Environments (appendix B.1) ==================================================
+# ==== 10. Environments (appendix B.1) =================================================
 
 # dm_control's domain and task: (dim O, dim A) of Figure 3
 TASKS = {
@@ -1554,7 +1660,7 @@ def training_seeds(seed, use, first, count):
     return [int(stream(seed, use, i).integers(2 ** 31)) for i in range(first, first + count)]
 
 
-# ==== 7. Files: weights, replay, records ==============================================
+# ==== 11. Files: weights, replay, records =============================================
 
 FORMAT = "fac-tdmpc-ref 1"
 
@@ -1756,7 +1862,7 @@ def data_file(task, name):
     return path
 
 
-# ==== 8. Commands =====================================================================
+# ==== 12. Commands ====================================================================
 
 def decisions(model, task, config, seeds, environment=None, noise=0.0):
     """Plan through the episode of each seed; yields every decision's observation (O,), action
@@ -1881,8 +1987,9 @@ def train_student(distiller, out, settings, planning, workers):
         header, arrays = read_npz(checkpoint, ("checkpoint",))
         try:
             same_settings(header["settings"], settings, checkpoint)
-            curve, before = header["curve"], float(header["seconds"])
             distiller.load(arrays)
+            if distiller.t:
+                curve, before = header["curve"], float(header["seconds"])
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise UserError(f"{checkpoint}: damaged ({error!r}); delete it to start anew") from None
     began = saved = time.time()
@@ -2028,18 +2135,26 @@ def record_returns(path, model, config, seed, returns):
 def command_distill(args):
     """distill: expert and replay in, student, learning curve, table and JSON out."""
     began = time.time()
-    preset = functools.partial(preset_values, preset=args.preset)
-    config = from_args(DistillConfig, args, **preset(DistillConfig))
+    preset = functools.partial(preset_values, preset="plain" if args.plain else args.preset)
+    config = from_args(DistillConfig, args, **preset(DistillConfig),
+                       **({"reuse": 1} if args.plain else {}))
     expert, header, replay, path = load_data(args)
     theirs = {**preset(PlannerConfig), **made_for(header, path)}
     own = PlannerConfig(**theirs)  # the expert's
-    around = args.preset == "default" and getattr(args, "PlannerConfig.prior") != "none"
-    planning = from_args(PlannerConfig, args, **{**theirs, **(STUDENT_PLANNING if around else {})})
+    around = getattr(args, "PlannerConfig.prior") != "none"
+    planning = from_args(PlannerConfig, args, **{
+        **theirs, **(student_planning(config) if around else {}),
+        **({"returns": "plain"} if args.plain else {})})
     planning = dataclasses.replace(planning, horizon=config.horizon)
+    distiller_class = PlainDistiller if args.plain else Distiller
+    if args.plain:
+        need((config.targets, config.policy_share, config.expert_episodes, config.reuse) ==
+             ("joint", 0, 0, 1), "--plain is Algorithm 1 as the paper has it: without "
+             "--targets, --policy-share, --expert-episodes and --reuse")
     out = Path(args.out or f"runs/{args.task}-{args.seed}")
     record = read_records(path).get(record_key(expert, own, args.eval_seed), ([], {}))
-    with contextlib.closing(Distiller(expert, replay, config, args.num_agents,
-                                      args.seed)) as distiller, locked(out):
+    with contextlib.closing(distiller_class(expert, replay, config, args.num_agents,
+                                            args.seed)) as distiller, locked(out):
         for model, config in ((expert, own), (distiller.student, planning)):
             check_memory(planning_numbers(model.config, config), config, model.config)
         teacher_of(distiller.student, planning)  # what is missing is missed now
@@ -2288,6 +2403,8 @@ def make_parser():
     add("--preset", choices=("default", "plain", "paper"), default="default", help="paper: the "
         "paper's value of every setting that names one below (days on a laptop); plain: the "
         "paper's method at this project's budget, without what it adds [D8] [D9]")
+    add("--plain", action="store_true", help="Part I of the module alone: the plain preset by the "
+        "loop and the planner that it reads; slower, and not resumed")
     add("--expert", help="expert file, or a folder with expert.npz and replay.npz [data/TASK]")
     add("--replay", help="replay file [replay.npz beside the expert]")
     add("--out", help="folder for the results [runs/TASK-SEED]")

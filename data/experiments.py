@@ -272,8 +272,8 @@ def distil(task, seed, case, settings):
     expert, header = fac.load_model(fac.data_file(task, "expert.npz"))
     distiller = distiller_of(case)(expert, fac.Replay(fac.data_file(task, "replay.npz")), config,
                                    own["num_agents"], seed)
-    around = fac.STUDENT_PLANNING if config.targets == "credit" else {}
-    planning = planning_for(header, {**around, **about, "horizon": config.horizon})
+    planning = planning_for(header, {**fac.student_planning(config), **about,
+                                     "horizon": config.horizon})
     student, environment = distiller.student, None
     if case == "TAP":  # whose actions are others, which the expert's policy doesn't know
         environment = DecodingEnvironment(task, expert, distiller.vae, planning.action_repeat)
@@ -350,8 +350,9 @@ def fresh_student(run):
     """The student of a run before it learned anything, which takes as long to plan with; header."""
     expert, header = fac.load_model(fac.data_file(run["task"], "expert.npz"))
     config, agents = fac.DistillConfig(), json.loads(run["settings"])["num_agents"]
-    sizes = fac.student_config(expert.config, agents, config.encoder_input)
-    return fac.new_student(expert, sizes, int(run["seed"]))[1], header
+    sizes = fac.student_config(expert.config, agents, config.encoder_input, expert.has_policy)
+    return (fac.new_student(expert, sizes, int(run["seed"]))[1],
+            {**header, "planner": fac.student_planning(config)})
 
 
 def command_departures(args):
@@ -367,10 +368,9 @@ def command_departures(args):
 
 def command_students(args):
     """students: what `distill` makes by default, for the README's main table."""
-    values = functools.partial(fac.preset_values, preset=args.preset)
-    defaults = {"steps": fac.DistillConfig(**values(fac.DistillConfig)).steps,
-                **vars(fac.PlannerConfig(**values(fac.PlannerConfig))),
-                **(fac.STUDENT_PLANNING if args.preset == "default" else {})}
+    config, planning = (of(**fac.preset_values(of, args.preset)) for of in (
+        fac.DistillConfig, fac.PlannerConfig))
+    defaults = {"steps": config.steps, **vars(planning), **fac.student_planning(config)}
     about = {k: getattr(args, k) or defaults[k] for k in ("steps", "samples", "iterations")}
     data = {task: data_checksums(task) for task in args.tasks}
     return run_all(args, functools.partial(students.distil_student, students=args.students), [

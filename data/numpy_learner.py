@@ -164,21 +164,22 @@ class Learner:
 
     def state(self):
         """Everything that a resumed run needs, as arrays."""
-        return {"slow": self.slow_vector, **named("expert", self.optimizer),
-                **named("policy", self.policy_optimizer)}
+        return {"slow": self.slow_vector, **named("expert", fac.optimizer_state(self.optimizer)),
+                **named("policy", fac.optimizer_state(self.policy_optimizer))}
 
     def load(self, arrays):
         """Go on from a `state`."""
         self.slow_vector[:] = arrays["slow"]
-        restore("expert", self.optimizer, arrays)
-        restore("policy", self.policy_optimizer, arrays)
+        load_named("expert", self.optimizer, arrays)
+        load_named("policy", self.policy_optimizer, arrays)
 
 
-def named(name, what):
-    """The state of a fac.Adam, or what else has one, under its name."""
-    return {f"{name} {key}": value for key, value in what.state().items()}
+def load_named(name, optimizer, arrays):
+    """Let an Adam go on from the state that `named` has put into arrays under this name."""
+    state = {key: arrays[f"{name} {key}"] for key in fac.optimizer_state(optimizer)}
+    fac.load_optimizer(optimizer, state)
 
 
-def restore(name, what, arrays):
-    """Give it the state that `named` has put into arrays."""
-    what.load({key: arrays[f"{name} {key}"] for key in what.state()})
+def named(name, state):
+    """A state, its entries under this name."""
+    return {f"{name} {key}": value for key, value in state.items()}

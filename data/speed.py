@@ -39,12 +39,12 @@ class Predictor:
 
     def __init__(self, model, workers=0):
         mine, *theirs = fac.split_agents(model.config.num_agents, workers)
-        self.model = model.agents(mine.start, mine.stop)
+        self.model = fac.some_agents(model, mine.start, mine.stop)
         sizes = self.model.config
         self._x = np.random.default_rng(0).standard_normal(
             (sizes.num_agents, sizes.latent_dim + sizes.agent_actions, TABLE3_BATCH), fac.F32)
         self._workers = fac.Workers(_prediction_worker, workers, "prediction worker")
-        self._workers.send_all(model.agents(share.start, share.stop) for share in theirs)
+        self._workers.send_all(fac.some_agents(model, share.start, share.stop) for share in theirs)
 
     def __call__(self, function):
         self._workers.send_all(itertools.repeat(function))
@@ -86,7 +86,7 @@ def benchmark_prediction(robot, workers, runs):
                     ("TAP", "one-thread", predictor(random_model(robot, 1, 512, 512, 2))),
                     ("Fac-TDMPC", "one-thread", predictor(factored)),
                     ("Fac-TDMPC", "processes", predictor(factored, workers)),
-                    ("Fac-TDMPC", "critical-path", predictor(factored.agents(0, 1)))]
+                    ("Fac-TDMPC", "critical-path", predictor(fac.some_agents(factored, 0, 1)))]
         calls = [(model, mode, f, functools.partial(predict, f))
                  for model, mode, predict in subjects for f in FUNCTIONS]
         seconds = fac.interleaved_seconds([call[-1] for call in calls], runs,
@@ -122,7 +122,7 @@ def benchmark_decisions(robot, workers, planning, rounds):
                     ("Fac-TDMPC", preset, "one-thread", factored, config,
                      planner(factored, config).act),
                     ("Fac-TDMPC", preset, "processes", factored, config, parallel.act),
-                    ("Fac-TDMPC", preset, "critical-path", factored.agents(0, 1), config,
+                    ("Fac-TDMPC", preset, "critical-path", fac.some_agents(factored, 0, 1), config,
                      one_agent(factored, config))]
         seconds = fac.interleaved_seconds(
             [lambda: matrix @ matrix, *(functools.partial(subject[-1], obs)
@@ -154,7 +154,7 @@ def _echo_worker(connection):
 
 def one_agent(model, config):
     """A decision's critical path: the encoder, then the plan of one agent (all are of one size)."""
-    alone = fac.AgentPlanner(model.agents(0, 1), config)
+    alone = fac.FastPlanner(fac.some_agents(model, 0, 1), config)
     alone.reset(np.random.SeedSequence(0).spawn(1))
     return lambda obs: alone.plan(model.encode(obs[:, None])[:1])
 

@@ -25,7 +25,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import fac_tdmpc_ref as fac  # noqa: E402
-from numpy_learner import ExpertConfig, Learner, named, restore  # noqa: E402
+from numpy_learner import ExpertConfig, Learner, load_named, named  # noqa: E402
 
 # for a few cores; hidden layers of 512, as in Table 2, make an update three times as dear
 TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
@@ -228,7 +228,7 @@ class OnlineStudent:
 
     def __init__(self, expert, num_agents, config, seed, own):
         self.config, self.seed, self.own = config, seed, own
-        sizes = fac.student_config(expert.config, num_agents, config.encoder_input)
+        sizes = fac.student_config(expert.config, num_agents, config.encoder_input, True)
         self.optimizer, self.model = fac.new_student(expert, sizes, seed)
 
     def update(self, expert, obs, actions):
@@ -242,7 +242,7 @@ class OnlineStudent:
             found, played, *_ = self.own.sample(rng, mine.stop, L)
             obs[:, mine], actions[:, :, mine] = found[0], played
         actions = fac.around_policy(expert, obs, actions, config.policy_share, rng)
-        batch = fac.perturbed_batch(expert, self.model, obs, actions[..., None], config, rng)
+        batch = fac.taught_batch(expert, self.model, obs, actions[..., None], config, rng)
         _, *divergences = fac.distill_loss(self.model, *batch, config, self.optimizer.grads)
         self.optimizer.step(fac.learning_rate(config, t), config.grad_clip)
         return divergences
@@ -374,8 +374,10 @@ class Training:
         planning = dataclasses.replace(self.planning, horizon=self.scheduled()["horizon"])
         planners = {"expert": (self.learner.model, planning)}
         if self.student:
+            config = self.student.config
             planners["student"] = self.student.model, dataclasses.replace(
-                planning, horizon=min(planning.horizon, self.student.config.horizon))
+                planning, horizon=min(planning.horizon, config.horizon),
+                **fac.student_planning(config))
         return planners
 
     def tests(self):
@@ -463,8 +465,8 @@ class Training:
         """Write the checkpoint and then, for it holds their rows, the curve."""
         learned = self.learner.state()
         if self.student:
-            learned.update({**named("student", self.student.optimizer),
-                            **named("own", self.student.own)})
+            learned.update({**named("student", fac.optimizer_state(self.student.optimizer)),
+                            **named("own", self.student.own.state())})
         for key, value in learned.items():
             fac.check_finite({f"weights ({key}) are": value}, self.learner.updates, self.config.lr)
         header = {key: getattr(self, key) for key in ("settings", "decisions", "allowed", "seconds",
@@ -482,8 +484,9 @@ class Training:
             fac.same_settings(header["settings"], self.settings, path)
             self.learner.load(arrays)
             if self.student:
-                restore("student", self.student.optimizer, arrays)
-                restore("own", self.student.own, arrays)
+                load_named("student", self.student.optimizer, arrays)
+                self.student.own.load({key: arrays[f"own {key}"]
+                                       for key in self.student.own.state()})
             self.buffer.load(arrays)
             for key in ("decisions", "allowed", "seconds", "curve"):
                 setattr(self, key, header[key])
@@ -593,6 +596,7 @@ def export(training, out, result):
         if kind == "student":
             settings = dataclasses.asdict(training.student.config)
             header["distill"] = {k: v for k, v in settings.items() if k not in NOT_ONLINE}
+            header["planner"] = fac.student_planning(training.student.config)
         fac.save_model(out / f"{kind}.npz", model, header)
         if args.episodes:
             planner = fac.PlannerConfig(**fac.made_for(header, out))

@@ -166,7 +166,7 @@ class Learner:
 
     def policy_noise(self, *shape):
         noise = self.torch.randn(*shape, self.dim_action, device=self.device)
-        return (noise * fac.POLICY_STD).clamp(-fac.POLICY_CUT, fac.POLICY_CUT)
+        return (noise * 0.05).clamp(-0.3, 0.3)  # fac.policy_noise
 
     def sample(self):
         """Segments drawn evenly: observations (H+1, T, B, O), actions (H, T, B, A), rewards."""

@@ -1,4 +1,5 @@
 """Algorithm 1 end to end on a small expert."""
+import ast
 import contextlib
 
 import numpy as np
@@ -121,7 +122,7 @@ def test_rank_correlations_are_over_32_sequences_discounted_as_planned(replay, m
     weights += 0.1 * np.random.default_rng(0).standard_normal(len(weights))
 
     def watched(expert, student, obs, around, *rest):
-        features, actions, predictions = fac.perturbed_batch(expert, student, obs, around, *rest)
+        features, actions, predictions = fac.taught_batch(expert, student, obs, around, *rest)
         copies.append(actions.shape[3])
         for state, sequence in zip(obs.T, around[..., 0].transpose(2, 0, 1)):
             ((row, *_),) = np.nonzero((replay.observation == state).all(1))
@@ -255,7 +256,7 @@ def test_perturbations_are_of_their_deviation_and_each_its_own(replay):
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1, 1, (4, 3, 20, 1)).astype(np.float32)
     with fresh(replay, config) as distiller:
-        _, perturbed, _ = fac.perturbed_batch(distiller.expert, distiller.student,
+        _, perturbed, _ = fac.taught_batch(distiller.expert, distiller.student,
                                               np.zeros((8, 20), np.float32), actions, config, rng)
     assert np.array_equal(perturbed[..., :1], actions)
     noise = (perturbed - actions)[..., 1:]
@@ -312,7 +313,7 @@ def test_with_credit_a_state_s_first_copy_is_not_perturbed(replay):
         expert = distiller.expert
         z = expert.encode(obs)
         policy = fac.policy_rollout(expert, z, [np.float32(0)] * 4)[:, 0]
-        _, joint, _ = fac.perturbed_batch(expert, distiller.student, obs, policy[..., None],
+        _, joint, _ = fac.taught_batch(expert, distiller.student, obs, policy[..., None],
                                           fac.dataclasses.replace(config, targets="joint"),
                                           np.random.default_rng(0))
     theirs = (np.abs(actions[..., 0] - policy) < 1e-5).all((0, 1))
@@ -509,7 +510,7 @@ def test_held_out_episodes_are_for_the_rank_correlation_alone(tmp_path, monkeypa
 
     def watched(expert, student, obs, *rest):
         seen.append(obs)
-        return fac.perturbed_batch(expert, student, obs, *rest)
+        return fac.taught_batch(expert, student, obs, *rest)
 
     monkeypatch.setattr(distiller, "perturb", watched)
     rank(distiller)
@@ -553,3 +554,33 @@ def test_an_expert_without_a_policy_says_so(replay):
     with pytest.raises(fac.UserError, match="no policy.*--policy-share 0 --expert-episodes 0"):
         fac.Distiller(expert, replay, CONFIG)
     fac.Distiller(expert, replay, fac.dataclasses.replace(CONFIG, policy_share=0.0)).close()
+
+
+def test_part_one_is_at_most_700_lines_and_stands_alone():
+    """It imports NumPy and four modules, and calls of Part II only what says so."""
+    text = (fac.DATA.parent / "fac_tdmpc_ref.py").read_text()
+    first, second = text.split("# ==== Part II")
+    assert first.count("\n") <= 700
+    scope = {"__name__": "fac_tdmpc_ref"}
+    exec(compile(first, "part one", "exec", dont_inherit=True), scope, scope)
+    used = {node.id for node in ast.walk(ast.parse(first))
+            if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load)}
+    assert {name for name in used if name in vars(fac) and name not in scope} == {
+        "check_settings", "seed_sequence"}  # which refuse what a user gives
+
+
+@pytest.mark.parametrize("num_agents", [1, 3])
+def test_the_distiller_is_algorithm_1_in_less_time(replay, monkeypatch, num_agents):
+    """The same batches as Part I's loop, one a pool: the same weights to rounding."""
+    monkeypatch.setattr(fac, "POOL", 16)
+    config = fac.dataclasses.replace(CONFIG, steps=30, targets="joint", policy_share=0.0, reuse=1)
+    fast, losses = distilled(replay, config, 30, num_agents)
+    plain = list(fac.distill(random_model(n=1, policy=True), replay, config, num_agents))
+    student = plain[-1][0]
+    for key in fast.optimizer.params:
+        if key in ("_reward.4.bias", "_Q1.5.bias", "_Q2.5.bias"):  # a softmax knows no constants:
+            continue  # Adam enlarges the rounding of a gradient of zero
+        np.testing.assert_allclose(fast.student.params[key], student.params[key], rtol=0,
+                                   atol=2e-4, err_msg=key)
+    np.testing.assert_allclose([found for _, found in plain], losses, rtol=1e-3)
+    assert losses[-1, 0] < 0.9 * losses[0, 0]

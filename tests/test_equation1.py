@@ -203,8 +203,10 @@ def test_the_policy_s_noise_is_constant_and_cut():
 def test_an_update_s_targets_and_policy_see_that_noise(monkeypatch):
     """With another deviation, target and policy learn something else; the rest is the same."""
     terms = []
-    for std in (0.05, 0.05, 0.5):
-        monkeypatch.setattr(fac, "POLICY_STD", std)
+    real = fac.policy_noise
+    for factor in (1, 1, 10):
+        monkeypatch.setattr(fac, "policy_noise", lambda *of, factor=factor: (
+            np.float32(factor) * real(*of)))
         rng = np.random.default_rng(5)
         learner = small_learner(rng, np.float32)
         found = learner.update(*small_batch(rng, dtype=np.float32), rng)

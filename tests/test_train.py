@@ -221,8 +221,8 @@ def test_a_share_of_an_online_student_s_states_is_its_own(monkeypatch):
     own, seen = train_expert.ReplayBuffer(8, 3, fac.EPISODE_STEPS), []
     config = fac.DistillConfig(batch_size=64, played_share=0.25)
     student = train_expert.OnlineStudent(expert, 3, config, 0, own)
-    real = fac.perturbed_batch
-    monkeypatch.setattr(fac, "perturbed_batch",
+    real = fac.taught_batch
+    monkeypatch.setattr(fac, "taught_batch",
                         lambda *args: seen.append((args[2], args[3])) or real(*args))
     for _ in range(2):
         student.update(expert, np.ones((8, 80), np.float32), np.ones((5, 3, 80), np.float32))
@@ -234,12 +234,12 @@ def test_a_share_of_an_online_student_s_states_is_its_own(monkeypatch):
 
 
 def test_an_online_student_s_own_actions_begin_where_their_state_is(monkeypatch):
-    sizes, seen, real = fac.ModelConfig(8, 3, 1, 4, 6, 6), [], fac.perturbed_batch
+    sizes, seen, real = fac.ModelConfig(8, 3, 1, 4, 6, 6), [], fac.taught_batch
     expert = fac.WorldModel.create(sizes, np.random.default_rng(0), policy=True)
     own = train_expert.ReplayBuffer(8, 3, fac.EPISODE_STEPS)
     own.add(*ramp(), np.zeros(fac.EPISODE_STEPS))
     config = fac.DistillConfig(batch_size=128, played_share=1.0)
-    monkeypatch.setattr(fac, "perturbed_batch", lambda *args: seen.append(args[2:4]) or real(*args))
+    monkeypatch.setattr(fac, "taught_batch", lambda *args: seen.append(args[2:4]) or real(*args))
     train_expert.OnlineStudent(expert, 3, config, 0, own).update(
         expert, np.ones((8, 128), np.float32), np.ones((4, 3, 128), np.float32))
     ((obs, actions),) = seen
@@ -277,7 +277,7 @@ def test_evaluations_are_of_episodes_apart_and_of_each_model_s_horizon():
 
 
 def test_every_update_has_states_and_perturbations_of_its_own(monkeypatch):
-    found, noise, states, real = training(), [], [], fac.perturbed_batch
+    found, noise, states, real = training(), [], [], fac.taught_batch
     found.buffer.add(*episode(np.random.default_rng(0), 1))
     sample = found.buffer.sample
     found.buffer.sample = lambda *args: states.append(sample(*args)) or states[-1]
@@ -286,7 +286,7 @@ def test_every_update_has_states_and_perturbations_of_its_own(monkeypatch):
         noise.append(real(expert, student, obs, 0 * actions, *rest)[1])
         return real(expert, student, obs, actions, *rest)
 
-    monkeypatch.setattr(fac, "perturbed_batch", perturbed)
+    monkeypatch.setattr(fac, "taught_batch", perturbed)
     for _ in range(2):
         found.learn()
     assert not np.array_equal(states[0][3][1], states[1][3][1])
@@ -297,10 +297,10 @@ def test_every_update_has_states_and_perturbations_of_its_own(monkeypatch):
 def test_expert_and_student_learn_over_their_own_horizons(horizon, monkeypatch):
     found, seen = training("--distill-horizon", str(horizon), "--distill-grad-clip", "0.5"), []
     found.buffer.add(*episode(np.random.default_rng(0), 1))
-    update, perturbed, student = found.learner.update, fac.perturbed_batch, found.student
+    update, perturbed, student = found.learner.update, fac.taught_batch, found.student
     monkeypatch.setattr(found.learner, "update", lambda obs, actions, reward, rng: (
         seen.append((len(obs), len(actions), len(reward))), update(obs, actions, reward, rng))[1])
-    monkeypatch.setattr(fac, "perturbed_batch", lambda *args: (
+    monkeypatch.setattr(fac, "taught_batch", lambda *args: (
         seen.append(len(args[3])), perturbed(*args))[1])
     step = student.optimizer.step
     monkeypatch.setattr(student.optimizer, "step", lambda lr, clip: (
