@@ -971,7 +971,7 @@ def teacher_of(model, config):
     return teacher
 
 
-WIDTHS = 0.05, 0.1, 0.15, 0.25, 0.4, 0.6  # deviations that a search around the policy may have
+WIDTHS = 0.05, 0.1, 0.15, 0.25  # of a search around the policy: no wider than what was taught
 
 
 def plan_gains(expert, model, config, obs, seed=0):
