@@ -1590,8 +1590,23 @@ REACHER_TARGET = {"easy": 0.05, "hard": 0.015}  # radius of the target, metres
 REACHER = DATA / "reacher.xml"  # three links; dm_control's has two
 
 
+def import_dm_control():
+    """dm_control's suite, rl.control, suite.reacher. Nothing else here imports MuJoCo."""
+    os.environ.setdefault("MUJOCO_GL", "disable")  # states only: needs no display
+    try:
+        from dm_control import suite
+        from dm_control.rl import control
+        from dm_control.suite import reacher
+    except (ImportError, RuntimeError, AttributeError) as error:
+        raise UserError(
+            f"dm_control does not import ({error}); it needs mujoco==3.17.0 beside "
+            f"dm-control==1.0.50, and MUJOCO_GL unset or one of egl, osmesa, disable "
+            f"(it is {os.environ['MUJOCO_GL']!r})") from error
+    return suite, control, reacher
+
+
 class Environment:
-    """One of the paper's 11 tasks. MuJoCo is imported here and nowhere else.
+    """One of the paper's 11 tasks, or another one of dm_control's suite.
 
     Observations are dm_control's dict, concatenated in its own order, float32 (dim O,).
     Actions (dim A,) in [-1, 1] are scaled to the action spec and applied `action_repeat` times.
@@ -1601,16 +1616,7 @@ class Environment:
         episode_steps(action_repeat)
         self.action_repeat = action_repeat
         domain, name, self.dim_obs, self.dim_action = lookup_task(task)
-        os.environ.setdefault("MUJOCO_GL", "disable")  # states only: needs no display
-        try:
-            from dm_control import suite
-            from dm_control.rl import control
-            from dm_control.suite import reacher
-        except (ImportError, RuntimeError, AttributeError) as error:
-            raise UserError(
-                f"dm_control does not import ({error}); it needs mujoco==3.17.0 beside "
-                f"dm-control==1.0.50, and MUJOCO_GL unset or one of egl, osmesa, disable "
-                f"(it is {os.environ['MUJOCO_GL']!r})") from error
+        suite, control, reacher = import_dm_control()
         if domain == "reacher":
             need(REACHER.exists(), f"{REACHER}: no such file; run from a clone of the repository")
             self.env = control.Environment(
@@ -1639,13 +1645,37 @@ class Environment:
         return self._observation(timestep), reward
 
 
+def task_names():
+    """What a task may be, for --help and errors."""
+    return f"{', '.join(TASKS)}, or another DOMAIN-TASK of dm_control's suite"
+
+
 def lookup_task(task):
     """(domain, name, dim O, dim A) of a task; UserError with the nearest name otherwise."""
-    if str(task) not in TASKS:
-        near = difflib.get_close_matches(str(task), TASKS, n=1, cutoff=0)
-        raise UserError(f"unknown task {task!r}; did you mean {near[0]!r}? "
-                        f"Known tasks: {', '.join(TASKS)}")
-    return *task.split("-"), *TASKS[task]
+    task = str(task)
+    return *task.split("-", 1), *(TASKS[task] if task in TASKS else suite_sizes(task))
+
+
+@functools.cache
+def suite_sizes(task):
+    """(dim O, dim A) of a task of dm_control's suite, DOMAIN-TASK, from its specs; UserError: it is
+    none, or its episodes can't be played."""
+    suite, *_ = import_dm_control()
+    known = {"-".join(names): names for names in suite.ALL_TASKS}
+    near = difflib.get_close_matches(task, [*TASKS, *known], n=1, cutoff=0)
+    need(task in known, f"unknown task {task!r}; did you mean {near[0]!r}? Known tasks: "
+         f"{task_names()}")
+    try:
+        env = suite.load(*known[task])
+        env.reset()
+    except RuntimeError as error:
+        raise UserError(f"{task}: dm_control can't play it here ({error}); MUJOCO_GL=egl or osmesa "
+                        "may help") from None
+    steps = env._step_limit  # it has no public name
+    need(steps == CONTROL_STEPS, f"{task}: its episodes have {steps} control steps; expected "
+         f"{CONTROL_STEPS}")
+    spec = env.observation_spec().values()
+    return sum(math.prod(s.shape) for s in spec), math.prod(env.action_spec().shape)
 
 
 def episode_seeds(seed, episodes, first=0):
@@ -2397,7 +2427,7 @@ def make_parser():
                       "factored student (Algorithm 1), then evaluate and time both with MPPI.",
                       epilog="Given again, a cut-off run goes on; a finished one is evaluated.")
     add = sub.add_argument
-    add("--task", default="reacher-hard", help="one of: " + ", ".join(TASKS))
+    add("--task", default="reacher-hard", help="one of: " + task_names())
     add("--seed", type=natural, default=0, help="of distillation [0]")
     add("--num-agents", type=int, help="N, a divisor of dim(A) [dim(A)]")
     add("--preset", choices=("default", "plain", "paper"), default="default", help="paper: the "
@@ -2421,7 +2451,7 @@ def make_parser():
                       "student) through whole episodes.")
     add = sub.add_argument
     add("--model", required=True, help="an expert.npz or student.npz")
-    add("--task", help="one of: " + ", ".join(TASKS) + " [the model's own]")
+    add("--task", help="one of: " + task_names() + " [the model's own]")
     add("--seed", type=natural, default=0, help="of the episodes [0]")
     add("--record", action="store_true", help="keep them in a .json beside the model, for distill")
     add("--episodes", type=positive, default=20, help="[20]")

@@ -391,7 +391,7 @@ def collect(path, environment, episodes, seed):
     model, header = fac.load_model(path)
     config = fac.PlannerConfig(**fac.made_for(header, path))
     steps = config.episode_steps
-    buffer = ReplayBuffer(*fac.TASKS[header["task"]], episodes * steps, steps=steps)
+    buffer = ReplayBuffer(*fac.lookup_task(header["task"])[2:], episodes * steps, steps=steps)
     with fac.Planner(model, config) as planner, \
             fac.progress("collecting", episodes * steps, "decision") as bar:
         for i in range(episodes):
@@ -480,7 +480,7 @@ def main(argv=None):
     """Run the command line; returns the exit status."""
     parser = fac.Parser(prog="import_expert.py", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("file", metavar="FILE", help="checkpoint: " + ", ".join(READERS))
-    parser.add_argument("--task", required=True, help="one of: " + ", ".join(fac.TASKS))
+    parser.add_argument("--task", required=True, help="one of: " + fac.task_names())
     parser.add_argument("--out", required=True, help="folder for expert.npz and replay.npz")
     parser.add_argument("--action-repeat", type=fac.natural, default=fac.ACTION_REPEAT, metavar="N",
                         help="control steps of the expert's decisions [%(default)s]")

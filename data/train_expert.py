@@ -649,7 +649,7 @@ def make_parser():
         "the same command is given again. Its folder is what distill takes as --expert.")
     add, natural = parser.add_argument, fac.natural
     positive = functools.partial(natural, least=1)
-    add("--task", default="reacher-easy", help="one of: " + ", ".join(fac.TASKS))
+    add("--task", default="reacher-easy", help="one of: " + fac.task_names())
     add("--steps", type=natural, default=30_000, help="decisions in all, two environment steps "
         "each; a run that is over goes on with more [30000]")
     add("--seed", type=natural, default=0, help="[0]")

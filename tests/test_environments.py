@@ -230,6 +230,25 @@ def test_unknown_task_is_told_the_nearest_and_all_known_ones(typed, meant):
         assert "\n" not in message
 
 
+def test_every_task_of_the_suite_works_or_says_why_not():
+    """A reset and two decisions each; without a display quadruped-escape can't be loaded."""
+    from dm_control import suite
+    refused = {}
+    for names in suite.ALL_TASKS:
+        try:
+            env = fac.Environment("-".join(names))
+        except fac.UserError as error:
+            refused["-".join(names)] = str(error)
+            continue
+        assert env.reset(0).shape == (env.dim_obs,)
+        for _ in range(2):
+            obs, reward = env.step(np.zeros(env.dim_action))
+            assert obs.shape == (env.dim_obs,) and obs.dtype == np.float32
+            assert np.isfinite(obs).all() and np.isfinite(reward)
+    assert "control steps" in refused.pop("lqr-lqr_2_1") and "inf" in refused.pop("lqr-lqr_6_2")
+    assert refused.keys() <= {"quadruped-escape"}
+
+
 def test_evaluation_seeds_are_distinct_and_do_not_depend_on_how_many():
     seeds = fac.episode_seeds(0, 50)
     assert len(set(seeds)) == 50 and seeds[:7] == fac.episode_seeds(0, 7)
