@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import fac_tdmpc_ref as fac
+import own_robot
 import train_expert
 from test_cli import ONE_THREAD, ROOT, WATCHED, last_json, launch, refused, run, succeeded
 from test_distill import ramp
@@ -605,3 +606,13 @@ def test_tests_beside_the_training_are_an_evaluation():
     finally:
         actors.close()
     assert returns == fac.evaluate(model, "reacher-easy", planning, 2, 0, 0)["returns"]
+
+
+def test_a_robot_of_one_s_own_is_learned_distilled_and_played(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(fac, "CONTROL_STEPS", 100)
+    monkeypatch.setattr(fac, "EPISODE_STEPS", 50)
+    own_robot.main(episodes=10, updates=2, steps=4, out=tmp_path)
+    for kind in ("expert", "student"):
+        assert fac.load_model(tmp_path / f"{kind}.npz")[0].config.dim_action == 2
+    said = capsys.readouterr().out.split("\n")
+    assert said[0].startswith("expert: ") and said[1].startswith("student: ")
