@@ -33,11 +33,10 @@ class Arm:
 
 def main(episodes=24, updates=400, steps=3000, out=Path("runs/own-robot")):
     """Train for so many episodes, with so many updates after each; distil for so many steps."""
-    robot, rng = Arm(), np.random.default_rng(0)
+    robot, rng, planning = Arm(), np.random.default_rng(0), fac.PlannerConfig(samples=64)
     sizes = fac.ModelConfig(dim_obs=8, dim_action=2, latent_dim=16, enc_dim=32, mlp_dim=64)
     learner = Learner(sizes, ExpertConfig(), rng)
     expert, buffer = learner.model, ReplayBuffer(8, 2, 10 ** 6, steps=fac.EPISODE_STEPS - 1)
-    planning = fac.PlannerConfig(samples=64, iterations=3)
     for i in range(episodes):  # less and less exploration
         found = fac.play(expert, None, planning, [i], environment=robot, noise=1 - i / episodes)
         buffer.add(found[0][0], found[1][0, :-1], found[2][0, :-1])
