@@ -7,7 +7,7 @@ action dimension. Each joint then plans alone: cheaper, and in parallel.
     python fac_tdmpc_ref.py distill --task reacher-hard
     python fac_tdmpc_ref.py evaluate --model runs/reacher-hard-0/student.npz
 
-Part I is the method as the paper has it, to be read from top to bottom: 1 settings, 2 layers,
+Part I is the method, with [D1] to [D7], to be read from top to bottom: 1 settings, 2 layers,
 3 world model, 4 distillation (Equation 4, Algorithm 1), 5 planning (Equations 2 and 3). It runs
 (`distill --plain`). Part II is what is added to it, the same in less time, and engineering. Experts
 learn, by Equation 1, in data/. Departures from the paper, [D1] to [D9], are in the README.
@@ -57,7 +57,7 @@ EPISODE_STEPS = CONTROL_STEPS // ACTION_REPEAT  # T: decisions in an episode
 
 
 def field(default, help, repr=True, **about):
-    """A dataclass field; about: range (`least`, `above`, `most`), `choices`, `paper`'s value."""
+    """A field; about: `least`, `above`, `most`, `choices`, values in presets `paper`, `plain`."""
     return dataclasses.field(default=default, repr=repr, metadata={"help": help, **about})
 
 
@@ -410,7 +410,7 @@ def layers(config, policy=False):
 
 
 def unroll(model, z, actions, tapes=None):
-    """Roll a model's latent out under given actions, every column on its own trajectory.
+    """Roll a model's latent out under given actions; all h side by side, so that heads run once.
 
     z (N, m, B), actions (L, A, B, K): K perturbed copies of a trajectory. Returns the networks'
     input x (N, m + d, L * B * K), columns in the order (L, B, K), with s_{h+1} = f_T(s_h, a_h).
@@ -442,7 +442,7 @@ def predict(model, z, actions):
 
 def heads_backward(model, tapes, d_shares, grads):
     """Walk `run_heads` back: adds to `grads`, returns dx (N, m + d, L * B * K). d_shares: gradients
-    of the shares (N, L, B, K), or of their sums (fewer rows), which each share in a sum has."""
+    by each share (N, L, B, K), or by sums of shares (fewer rows), the same for each summand."""
     n, dx = model.config.num_agents, 0
     for (name, kinds), d in zip(HEADS, d_shares):
         d = np.repeat(d, n // len(d), 0).reshape(n, 1, -1)
@@ -509,8 +509,8 @@ def distill_loss(student, features, actions, targets, config, grads=None, diverg
 
 
 def divergences(heads, targets, config, divergence=soft_kl):
-    """The sum in `distill_loss` of a student's `run_heads`: what that returns, and its gradients by
-    the shares, three (N, L, B, K), or where targets are joint (1, L, B, K)."""
+    """What `distill_loss` returns, of `run_heads`' shares, and the loss's gradients by them: three
+    (N, L, B, K), or where targets are joint (1, L, B, K), the same for all agents."""
     _, L, B, K = heads[0].shape
     lam = (config.lam ** np.arange(L) / B).astype(heads[0].dtype)[:, None]
     loss, means, d_shares = 0.0, [], []
@@ -563,8 +563,8 @@ def distill(expert, replay, config, num_agents=None, seed=0):
     """Algorithm 1: a factored student of an expert; yields it with each step's losses.
 
     replay: the dataset; `starts` are rows that H + 1 actions follow, `sequences` g_0 and these.
-    `Distiller` is this loop with predictions that serve several steps [D1], more states [D8] and
-    credit [D9]."""
+    Part II's `Distiller` is this loop with pools of predictions, each for several steps [D1], more
+    states [D8] and credit [D9]."""
     agents = expert.config.dim_action if num_agents is None else num_agents
     sizes = student_config(expert.config, agents, config.encoder_input)
     optimizer, student = new_student(expert, sizes, seed)
@@ -602,9 +602,9 @@ def mppi(returns, mean, config, rngs, proposals=None):
 
     returns: actions (N, L, d, S) -> every G_i (N, S); mean (N, L, d): the first Gaussian's; rngs:
     one Generator for each agent; proposals (N, L, d, P): sequences that compete in every iteration.
-    Elites are chosen agent by agent (Equation 3): a plan's G is sum_i G_i(a_i): the best of each is
-    the best of all (Proposition 1). N = 1 is centralized MPPI. Returns the new mean (N, L, d), the
-    last elites (N, L, d, E), scores (N, E) of sum 1 each, NaN where an agent has no finite G."""
+    Elites are chosen agent by agent: a plan's G is sum_i G_i(a_i), so the best of each is the best
+    of all (Equation 3, Proposition 1). N = 1 is centralized MPPI. Returns the new mean (N, L, d),
+    the last elites (N, L, d, E), scores (N, E) of sum 1, NaN where an agent has no finite G."""
     mean, std, elites, scores = mean[..., None], F32(config.max_std), None, None
     if proposals is not None:
         G_proposals = returns(proposals)
@@ -2179,8 +2179,8 @@ def command_distill(args):
     distiller_class = PlainDistiller if args.plain else Distiller
     if args.plain:
         need((config.targets, config.policy_share, config.expert_episodes, config.reuse) ==
-             ("joint", 0, 0, 1), "--plain is Algorithm 1 as the paper has it: without "
-             "--targets, --policy-share, --expert-episodes and --reuse")
+             ("joint", 0, 0, 1), "--plain is Algorithm 1 alone: without --targets, "
+             "--policy-share, --expert-episodes and --reuse")
     out = Path(args.out or f"runs/{args.task}-{args.seed}")
     record = read_records(path).get(record_key(expert, own, args.eval_seed), ([], {}))
     with contextlib.closing(distiller_class(expert, replay, config, args.num_agents,
