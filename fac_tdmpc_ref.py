@@ -1038,6 +1038,17 @@ def one_thread():
     return _thread_pools().limit(limits=1, user_api="blas")
 
 
+def compact(rows):
+    """Rows (M, F) in float16, which is half as much; in float32 where that would move a feature by
+    more than a hundredth of its deviation, as one with an offset or a tiny scale."""
+    rows = np.asarray(rows, F32)
+    with np.errstate(all="ignore"):  # what is too large is infinite
+        half = rows.astype(np.float16)
+        apart, error = rows - rows[:1], half - rows
+    good = (error - error[:1]).std(0, dtype=float) <= 0.01 * apart.std(0, dtype=float)
+    return half if good.all() else rows
+
+
 POOL, PART = 4096, 64  # states that the expert predicts at once, and a thread's part of them
 EXPERT_NOISE = 0.6  # largest deviation of the noise in episodes that its policy plays [D8]
 
@@ -1066,7 +1077,8 @@ class Distiller:
              "--plan-prior none")
         need(theirs.num_agents == 1 or config.targets == "joint", f"the expert has "
              f"{theirs.num_agents} agents, credit is for one; pass --targets joint")
-        self.played = np.zeros((0, 0, replay.dim_obs + replay.dim_action), np.float16)
+        self.played = np.zeros((0, replay.dim_obs + replay.dim_action), np.float16)
+        self.lengths = np.zeros(0, np.int64)
         agents = theirs.dim_action if num_agents is None else num_agents
         needed = config.steps * config.batch_size // config.reuse
         self.pool_size = max(config.batch_size, min(POOL, needed))
@@ -1090,9 +1102,10 @@ class Distiller:
         obs, actions = self.replay.sequences(rng.choice(self.train_starts, size), L)
         is_played = len(self.played) and rng.random(size) < self.config.played_share
         if count := np.sum(is_played):
-            episode = rng.integers(len(self.played), size=count)
-            t = rng.integers(self.played.shape[1] - L + 1, size=count) + np.arange(L)[:, None]
-            seen, done = np.split(self.played[episode, t].swapaxes(1, 2).astype(F32),
+            episode = rng.integers(len(self.lengths), size=count)
+            t = rng.integers(self.lengths[episode] - L + 1) + np.arange(L)[:, None]
+            rows = (np.cumsum(self.lengths) - self.lengths)[episode] + t
+            seen, done = np.split(self.played[rows].swapaxes(1, 2).astype(F32),
                                   [self.replay.dim_obs], 1)
             obs[:, is_played], actions[:, :, is_played] = seen[0], done  # seen (L, O, count)
         if self.config.policy_share:
@@ -1152,22 +1165,29 @@ class Distiller:
         return self.optimizer.t
 
     def add(self, observation, action):
-        """Let episodes (E, T, O), (E, T, A) join `played` (all, T, O + A) [D8]; any T above H."""
-        episodes = np.concatenate([observation, action], 2)
-        need((np.abs(episodes) <= 65504).all(), "played episodes: not finite, or above 65504")
-        episodes = episodes.astype(np.float16)
-        self.played = np.concatenate([self.played, episodes]) if len(self.played) else episodes
+        """Let episodes (E, T, O), (E, T, A), NaN past their ends, join `played`, the rows
+        (all, O + A) of episodes of `lengths` [D8]; those of H decisions or fewer are left out."""
+        episodes, L = np.concatenate([observation, action], 2), self.config.horizon + 1
+        good = np.isfinite(observation).all(2) & (np.abs(action) <= 1).all(2)
+        past = np.logical_and.accumulate(np.isnan(episodes).all(2)[:, ::-1], 1)[:, ::-1]
+        for e, t in np.argwhere(~(good | past))[:1]:
+            raise UserError(f"played episodes: not finite, or an action outside [-1, 1]: decision "
+                            f"{t} of episode {e}")
+        long = good.sum(1) >= L
+        need(long.any(), f"played episodes: none has {L} decisions, one more than the horizon")
+        self.played = np.concatenate([self.played, compact(episodes[long][good[long]])])
+        self.lengths = np.concatenate([self.lengths, good[long].sum(1)])
         self._number = None  # its pool is drawn again, with them
 
     def state(self):
         """Everything that a resumed run needs."""
-        return {**optimizer_state(self.optimizer), "played": self.played}
+        return {**optimizer_state(self.optimizer), "played": self.played, "lengths": self.lengths}
 
     def load(self, state):
         """Go on from a `state`."""
         load_optimizer(self.optimizer, state)
-        shape = *state["played"].shape[:2], self.played.shape[2]  # or it is another robot's
-        self.played, self._number = state["played"].reshape(shape), None
+        played = state["played"].reshape(-1, self.played.shape[1])  # or it is another robot's
+        self.played, self.lengths, self._number = played, state["lengths"], None
 
     def close(self):
         """Stop the threads."""
@@ -1425,6 +1445,21 @@ def useful_workers(agents):
     return min(agents, cores()) - 1
 
 
+def observed(obs, sizes, what="observation"):
+    """A copy of an observation, float32 (O,), for a robot may use its array again. UserError: of
+    another shape than a model's `sizes` say, or not finite."""
+    shape = (sizes.dim_obs,)
+    try:
+        with np.errstate(over="ignore"):
+            obs = np.array(obs, F32)
+    except (TypeError, ValueError):
+        raise UserError(f"{what}: expected numbers of shape {shape}, found what NumPy makes no "
+                        "array of them of") from None
+    need(obs.shape == shape, f"{what}: expected shape {shape}, found {obs.shape}")
+    need(np.isfinite(obs).all(), f"{what}: holds values that are not finite")
+    return obs
+
+
 class Planner(contextlib.ExitStack):  # whose `close` ends the workers
     """Observation in, action out; an episode's next plan starts from the last one's mean.
 
@@ -1460,14 +1495,7 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
 
     def act(self, obs):
         """obs (O,) -> action (A,), float32 in [-1, 1]. UserError: other shape, NaN, no finite G."""
-        shape = (self.model.config.dim_obs,)
-        try:
-            obs = np.asarray(obs, F32)
-        except (TypeError, ValueError):
-            raise UserError(f"observation: expected numbers of shape {shape}, found what NumPy "
-                            "makes no array of them of") from None
-        need(obs.shape == shape, f"observation: expected shape {shape}, found {obs.shape}")
-        need(np.isfinite(obs).all(), "observation: holds values that are not finite")
+        obs = observed(obs, self.model.config)
         with one_thread():
             z, prior = self.model.encode(obs[:, None]), self._prior(obs)
             tasks = [(z[part], prior if prior is None else prior[part]) for part in self._parts]
@@ -1598,8 +1626,7 @@ class Environment:
     Raises UserError for an unknown task or an installation that dm_control can't work with."""
 
     def __init__(self, task, action_repeat=ACTION_REPEAT):
-        episode_steps(action_repeat)
-        self.action_repeat = action_repeat
+        self.action_repeat, self.episode_steps = action_repeat, episode_steps(action_repeat)
         domain, name, self.dim_obs, self.dim_action = lookup_task(task)
         os.environ.setdefault("MUJOCO_GL", "disable")  # states only: needs no display
         try:
@@ -1635,8 +1662,25 @@ class Environment:
         control, reward = self._low + self._scale * (np.asarray(action, np.float64) + 1), 0.0
         for _ in range(self.action_repeat):
             timestep = self.env.step(control)
+            need(timestep.reward is not None, f"the episode is over ({self.episode_steps} "
+                 "decisions), or none has begun; call reset(seed)")
             reward += timestep.reward
         return self._observation(timestep), reward
+
+
+def robot_step(robot, action, sizes, t):
+    """Decision t of an episode: next observation (O,), reward, whether it is over. What goes to and
+    fro is copied. A robot's third value, if any, tells the end, or dm_control's reward of None: the
+    next episode has begun, and all of this is none of ours. UserError: what isn't finite."""
+    found = robot.step(np.array(action))
+    need(isinstance(found, (tuple, list)) and len(found) in (2, 3), f"decision {t}: expected of "
+         "step(action) (observation, reward), perhaps a third, whether the episode is over")
+    if found[1] is None and t:
+        return None, None, True
+    reward = np.ravel(np.asarray(found[1], float))  # None is NaN
+    need(reward.size == 1 and np.isfinite(reward[0]), f"decision {t}: expected a finite reward, "
+         f"found {found[1]!r}")
+    return observed(found[0], sizes, f"decision {t}: observation"), reward.item(), any(found[2:])
 
 
 def lookup_task(task):
@@ -1866,23 +1910,28 @@ def data_file(task, name):
 
 def decisions(model, task, config, seeds, environment=None, noise=0.0):
     """Plan through the episode of each seed; yields every decision's observation (O,), action
-    (A,), reward and seconds of planning. environment: instead of the task's, equally long. noise:
-    each episode draws the deviation of what is added to its actions, evenly from 0 to this."""
+    (A,), reward and seconds of planning; past its end up to T NaN, reward 0. environment: instead
+    of the task's, see `robot_step`; with T as `episode_steps` if it has that. noise: each episode
+    draws the deviation of what is added to its actions, evenly from 0 to this."""
     environment = Environment(task, config.action_repeat) if environment is None else environment
-    planner = Planner(model, config)
+    planner, sizes = Planner(model, config), model.config
+    past = np.full(sizes.dim_obs, np.nan), np.full(sizes.dim_action, np.nan), 0.0, np.nan
     for seed in seeds:
         planner.reset(seed)
-        obs, rng = environment.reset(seed), stream(seed, "exploration")
-        deviation = F32(rng.uniform(0, noise))
-        for _ in range(config.episode_steps):
+        obs, rng = observed(environment.reset(seed), sizes), stream(seed, "exploration")
+        deviation, over = F32(rng.uniform(0, noise)), False
+        for t in range(getattr(environment, "episode_steps", config.episode_steps)):
+            if over:
+                yield past
+                continue
             begin = time.perf_counter()
             action = planner.act(obs)
             seconds = time.perf_counter() - begin
             if noise:
                 action = action + deviation * rng.standard_normal(action.shape, F32)
                 action = np.clip(action, -1, 1)
-            before, (obs, reward) = obs, environment.step(action)
-            yield before, action, reward, seconds
+            before, (obs, reward, over) = obs, robot_step(environment, action, sizes, t)
+            yield past if obs is None else (before, action, reward, seconds)
 
 
 def _playing_worker(connection):
@@ -1895,11 +1944,13 @@ def _playing_worker(connection):
 
 def play(model, task, config, seeds, workers=None, label="playing", environment=None, noise=0.0):
     """Plan through the episodes of `seeds`: observations (E, T, O), actions (E, T, A), rewards
-    (E, T) and seconds of planning (E, T), with T = config.episode_steps.
+    (E, T) and seconds of planning (E, T). T is the longest episode's; past a shorter one's end they
+    are NaN, its rewards 0.
 
     workers: processes that share the episodes [one for each core]; 0, or with an `environment`: all
     in this one. An episode depends on its seed, not on their number. noise: as `decisions`'s."""
-    E, T, sizes = len(seeds), config.episode_steps, model.config
+    T = getattr(environment, "episode_steps", config.episode_steps)
+    E, sizes = len(seeds), model.config
     at_once = math.gcd(T, 25)  # decisions of a worker's message: of one episode
     found = [np.zeros((E, T, *shape), F32) for shape in ((sizes.dim_obs,), (sizes.dim_action,))]
     found += [np.zeros((E, T)) for _ in range(2)]
@@ -1921,7 +1972,8 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
                     done[w] += len(played)
             bar.update(sum(done) - bar.n)
             bar.set_postfix_str(f"mean return about {found[2].sum() * T / sum(done):.0f}", False)
-    return found
+    longest = np.isfinite(found[0][..., 0]).sum(1).max(initial=0)
+    return [array[:, :longest] for array in found]
 
 
 def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="evaluating"):

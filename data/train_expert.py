@@ -51,7 +51,8 @@ class Episode:
     def __init__(self, environment, seed, player=None, exploration_std=0.0):
         self.environment, self.seed, self.player = environment, seed, player
         self.exploration_std, self.rng = exploration_std, fac.stream(seed, "exploration")
-        self.observation, self.action, self.reward = [environment.reset(seed)], [], []
+        self.observation = [fac.observed(environment.reset(seed), environment)]
+        self.action, self.reward = [], []
         self._warm_start = None
 
     def play(self, planner, decisions):
@@ -62,7 +63,10 @@ class Episode:
             planner.reset(self.seed)
         for _ in range(decisions):
             self.action.append(self._explore(planner))
-            obs, reward = self.environment.step(self.action[-1])
+            obs, reward, over = fac.robot_step(self.environment, self.action[-1], self.environment,
+                                               len(self.reward))
+            fac.need(not over, f"decision {len(self.reward)}: the episode is over; to learn from, "
+                     "all must be equally long")
             self.observation.append(obs)
             self.reward.append(reward)
         own = planner and planner.own

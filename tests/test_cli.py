@@ -567,7 +567,8 @@ def test_a_killed_run_whose_expert_plays_goes_on(tmp_path, files, no_plots):
     for stop in (3, 5):
         assert distill("parts", "--workers", "2", stop=stop).returncode == -signal.SIGKILL
     with np.load(tmp_path / "parts" / "checkpoint.npz") as file:
-        assert file["played"].shape == (2, fac.EPISODE_STEPS, 8 + 3)  # states and actions
+        assert file["played"].shape == (2 * fac.EPISODE_STEPS, 8 + 3)  # states and actions
+        assert file["lengths"].tolist() == [fac.EPISODE_STEPS] * 2
     succeeded(distill("parts"))
     assert student_of(tmp_path / "parts") == student_of(tmp_path / "whole")
     without = distill_arguments(files, "--out", tmp_path / "without")
