@@ -1623,21 +1623,30 @@ class Environment:
 
     Observations are dm_control's dict, concatenated in its own order, float32 (dim O,).
     Actions (dim A,) in [-1, 1] are scaled to the action spec and applied `action_repeat` times.
-    Raises UserError for an unknown task or an installation that dm_control can't work with."""
+    render: whether `env.physics.render` is wanted, which the first of a process decides. Raises
+    UserError for an unknown task or an installation that dm_control can't work with."""
 
-    def __init__(self, task, action_repeat=ACTION_REPEAT):
+    def __init__(self, task, action_repeat=ACTION_REPEAT, render=False):
         self.action_repeat, self.episode_steps = action_repeat, episode_steps(action_repeat)
         domain, name, self.dim_obs, self.dim_action = lookup_task(task)
-        os.environ.setdefault("MUJOCO_GL", "disable")  # states only: needs no display
+        backend = os.environ.get("MUJOCO_GL")
         try:
-            from dm_control import suite
+            import mujoco  # noqa: F401  (whose own renderer is the caller's)
+            if backend is None and not render:  # states only: dm_control needs no display
+                os.environ["MUJOCO_GL"] = "disable"
+            from dm_control import _render, suite
             from dm_control.rl import control
             from dm_control.suite import reacher
         except (ImportError, RuntimeError, AttributeError) as error:
             raise UserError(
                 f"dm_control does not import ({error}); it needs mujoco==3.17.0 beside "
                 f"dm-control==1.0.50, and MUJOCO_GL unset or one of egl, osmesa, disable "
-                f"(it is {os.environ['MUJOCO_GL']!r})") from error
+                f"(it is {backend!r})") from error
+        finally:
+            if backend is None:
+                os.environ.pop("MUJOCO_GL", None)
+        need(not render or _render.BACKEND not in (None, "off"), "render=True: nothing draws "
+             "here; make the process's first Environment so, with MUJOCO_GL unset, egl or osmesa")
         if domain == "reacher":
             need(REACHER.exists(), f"{REACHER}: no such file; run from a clone of the repository")
             self.env = control.Environment(

@@ -41,7 +41,7 @@ def watch_episode(path, model, header, task, seed, decisions, every):
     """Frames of a model's episode: picture, shares (N,) and return so far of each; its name, the
     median milliseconds of a decision, and the return in the end."""
     config = fac.PlannerConfig(**fac.made_for(header, path))
-    environment = fac.Environment(task, config.action_repeat)
+    environment = fac.Environment(task, config.action_repeat, render=True)
     frames, total, seconds = [], 0.0, []
     with fac.Planner(model, config) as planner, fac.progress(f"playing {path}", decisions,
                                                              "decision") as bar:
@@ -184,10 +184,10 @@ def frames_at(task, seed, actions, moments, action_repeat):
     """Pictures of an episode, played again, before these decisions; {} where nothing draws."""
     try:
         choose_renderer()
+        environment, found = fac.Environment(task, action_repeat, render=True), {}
     except fac.UserError as error:
         print(error, file=sys.stderr)
         return {}
-    environment, found = fac.Environment(task, action_repeat), {}
     environment.reset(seed)
     for t in range(max(moments) + 1):
         if t in moments:

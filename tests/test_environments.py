@@ -14,6 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 import fac_tdmpc_ref as fac  # noqa: E402
+import look  # noqa: E402
 import train_expert  # noqa: E402
 from test_planning import random_model  # noqa: E402
 
@@ -295,7 +296,8 @@ def test_an_environment_says_that_its_episode_is_over(repeat, begin):
         env.reset(0)
         for _ in range(env.episode_steps):
             env.step(np.zeros(3))
-    with pytest.raises(fac.UserError, match=rf"\({1000 // repeat} decisions\).* call reset\(seed\)"):
+    message = rf"is over \({1000 // repeat} decisions\).* call reset\(seed\)"
+    with pytest.raises(fac.UserError, match=message):
         env.step(np.zeros(3))
     env.reset(0)
     env.step(np.zeros(3))
@@ -377,6 +379,39 @@ def test_a_bad_rendering_setting_is_explained():
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
     assert "MUJOCO_GL" in done.stdout and "'nonsense'" in done.stdout
     assert done.stdout.count("\n") == 1
+
+
+@pytest.mark.parametrize("before", [None, "egl"])
+@pytest.mark.parametrize("render", [False, True])
+def test_making_an_environment_leaves_the_variables_as_they_were(before, render):
+    """And MuJoCo's own renderer there, for a caller who draws in the same program."""
+    code = (f"import os; before = {before!r}; os.environ.pop('MUJOCO_GL', None)\n"
+            "if before: os.environ['MUJOCO_GL'] = before\n"
+            "import fac_tdmpc_ref as fac\n"
+            f"try: fac.Environment('reacher-hard', render={render})\n"
+            "except fac.UserError as error: print(error)\n"
+            "import mujoco; assert os.environ.get('MUJOCO_GL') == before\n"
+            "assert hasattr(mujoco, 'GLContext')")
+    done = python(code)
+    assert done.returncode == 0, done.stderr
+
+
+def test_an_environment_that_can_draw_and_one_that_came_too_late(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "")  # put back in the end
+    try:
+        look.choose_renderer()
+    except fac.UserError as error:
+        pytest.skip(str(error))
+    done = python("import fac_tdmpc_ref as fac\n"
+                  "print(fac.Environment('reacher-hard', render=True)"
+                  ".env.physics.render(8, 8).shape)")  # by what was chosen
+    assert done.stdout == "(8, 8, 3)\n", done.stderr
+    environ = {k: v for k, v in os.environ.items() if k != "MUJOCO_GL"}
+    late = "import fac_tdmpc_ref as fac; fac.Environment('reacher-hard')\ntry: " \
+           "fac.Environment('reacher-hard', render=True)\nexcept fac.UserError as e: print(e)"
+    done = subprocess.run([sys.executable, "-c", late], capture_output=True, text=True, cwd=ROOT,
+                          env=environ, timeout=60)
+    assert "render=True" in done.stdout and done.stdout.count("\n") == 1, done.stderr
 
 
 # reacher ------------------------------------------------------------------------------
