@@ -708,6 +708,7 @@ import contextlib
 import csv
 import difflib
 import importlib.metadata
+import io
 import itertools
 import json
 import math
@@ -1618,6 +1619,18 @@ REACHER_TARGET = {"easy": 0.05, "hard": 0.015}  # radius of the target, metres
 REACHER = DATA / "reacher.xml"  # three links; dm_control's has two
 
 
+@contextlib.contextmanager
+def variable(name, value):
+    """The process's variable `name` has this value inside; what it had, or none, behind."""
+    before = os.environ.get(name)
+    try:
+        os.environ.update({} if value is None else {name: value})
+        yield
+    finally:
+        os.environ.pop(name, None)
+        os.environ.update({} if before is None else {name: before})
+
+
 class Environment:
     """One of the paper's 11 tasks. MuJoCo is imported here and nowhere else.
 
@@ -1632,19 +1645,15 @@ class Environment:
         backend = os.environ.get("MUJOCO_GL")
         try:
             import mujoco  # noqa: F401  (whose own renderer is the caller's)
-            if backend is None and not render:  # states only: dm_control needs no display
-                os.environ["MUJOCO_GL"] = "disable"
-            from dm_control import _render, suite
-            from dm_control.rl import control
-            from dm_control.suite import reacher
+            with variable("MUJOCO_GL", backend if backend or render else "disable"):
+                from dm_control import _render, suite  # for states only it needs no display
+                from dm_control.rl import control
+                from dm_control.suite import reacher
         except (ImportError, RuntimeError, AttributeError) as error:
             raise UserError(
                 f"dm_control does not import ({error}); it needs mujoco==3.17.0 beside "
                 f"dm-control==1.0.50, and MUJOCO_GL unset or one of egl, osmesa, disable "
                 f"(it is {backend!r})") from error
-        finally:
-            if backend is None:
-                os.environ.pop("MUJOCO_GL", None)
         need(not render or _render.BACKEND not in (None, "off"), "render=True: nothing draws "
              "here; make the process's first Environment so, with MUJOCO_GL unset, egl or osmesa")
         if domain == "reacher":
@@ -2005,9 +2014,10 @@ def check_task(sizes, task, what="the model"):
 def progress(label, total, unit, initial=0):
     """A progress bar on stderr with rate and remaining time."""
     from tqdm import tqdm
-    return tqdm(desc=label, total=total, initial=initial, unit=unit, file=sys.stderr,
+    return tqdm(desc=label, total=total, initial=initial, unit=unit,
+                file=sys.stderr or io.StringIO(),  # or it is closed
                 dynamic_ncols=True, smoothing=0.1, leave=None,  # one below another vanishes
-                mininterval=0.5 if sys.stderr.isatty() else 20)
+                mininterval=0.5 if os.isatty(2) else 20)
 
 
 def interleaved_seconds(calls, rounds, label):
@@ -2116,14 +2126,15 @@ def optional(library, extra):
 
 def pyplot():
     """matplotlib.pyplot, in this project's style, without a display; UserError if missing."""
-    with optional("matplotlib", "plots"):
+    with optional("matplotlib", "plots"), variable("MPLBACKEND", "Agg"):  # a notebook's is its own
         import matplotlib
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
     cycle = matplotlib.cycler(  # told apart in black and white, too
         color=["#0072b2", "#d55e00", "#009e73", "#333333", "#cc79a7", "#e69f00", "#56b4e9"],
         linestyle=["-", "--", "-.", ":", "-", "--", "-."])
-    plt.rcParams.update({"axes.grid": True, "grid.alpha": 0.3, "axes.prop_cycle": cycle})
+    plt.rcParams.update({"axes.grid": True, "grid.alpha": 0.3, "axes.prop_cycle": cycle,
+                         "text.usetex": False})
     return plt
 
 
@@ -2134,12 +2145,19 @@ def save_figure(path, figure):
     pyplot().close(figure)
 
 
-def draw_curve(path, curve, title):
-    """Losses and rank correlations over the steps; False where matplotlib is missing."""
+def drawn(draw, path, *what):
+    """Whether draw(path, ...) made its picture; what goes wrong is said, and costs nothing else."""
     try:
-        plt = pyplot()
-    except UserError:
+        draw(path, *what)
+        return True
+    except Exception as error:
+        print(f"{path}: no picture: {' '.join(str(error).split())[:300]}", file=sys.stderr)
         return False
+
+
+def draw_curve(path, curve, title):
+    """Losses and rank correlations over the steps."""
+    plt = pyplot()
     columns = dict(zip(CURVE, np.array(curve).T))
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
     for ax, lines in zip(axes, ({"kl_reward": "rewards", "kl_value": "values"}, {
@@ -2152,7 +2170,6 @@ def draw_curve(path, curve, title):
     axes[0].set(yscale="log", ylabel="KL divergence", title=title)
     axes[1].set(ylim=(None, 1), ylabel="rank correlation", title="held-out states")
     save_figure(path, figure)
-    return True
 
 
 def read_records(path):
@@ -2224,7 +2241,7 @@ def command_distill(args):
         both = (expert, own), (distiller.student, planning)
         result.update(evaluate_both(*both, record, args))
         result.update(time_both(*both, obs))
-        result["seconds_total"] = round(time.time() - began, 1)
+        result["seconds_total"] = round(result["seconds_total"] + time.time() - began, 1)
         write_json(out / "result.json", result)
     report(result, (own, planning), args.eval_seed)
     return result
@@ -2265,7 +2282,9 @@ def distil_and_save(distiller, args, planning, header, out):
     print(f"{args.task}: {student.config.num_agents} agents, {len(distiller.optimizer.vector):,} "
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
-    curve, seconds = train_student(distiller, out, settings, planning, args.workers)
+    began, (curve, seconds) = time.time(), train_student(distiller, out, settings, planning,
+                                                         args.workers)
+    before = seconds - (time.time() - began)  # in runs of this command that were cut off, or done
     width, gains = planning.max_std, None
     if planning.prior == "policy" and getattr(args, "PlannerConfig.max_std") is None:
         width, gains = search_width(distiller, planning)
@@ -2275,11 +2294,12 @@ def distil_and_save(distiller, args, planning, header, out):
         "planner": {name: getattr(planning, name) for name in STUDENT_PLANNING}})
     write_json(out / "config.json", {**settings, "planner": asdict(planning)})
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
-            "steps": config.steps, "seconds": round(seconds, 1), "kl_reward": curve[-1][3],
-            "kl_value": curve[-1][4], **rank_results(distiller, 256, planning.discount),
+            "steps": config.steps, "seconds": round(seconds, 1), "seconds_total": before,
+            "kl_reward": curve[-1][3], "kl_value": curve[-1][4],
+            **rank_results(distiller, 256, planning.discount),
             "search_width": width, "plan_gains": gains, "out": str(out),
-            "picture": draw_curve(out / "curve.png", curve,
-                                  f"{args.task}, seed {args.seed}")}, planning
+            "picture": drawn(draw_curve, out / "curve.png", curve,
+                             f"{args.task}, seed {args.seed}")}, planning
 
 
 def evaluate_both(expert, student, record, args):
@@ -2356,7 +2376,7 @@ def report(result, plannings, eval_seed):
         if width == result["search_width"]:
             print(f"plans around the policy, deviation {width}: {gain:.2f} ± {se:.2f} above it by "
                   f"the expert's G in held-out states, {promise:.2f} by the student's")
-    print("" if result["picture"] else "pip install 'fac-tdmpc-ref[plots]' draws curve.png, too")
+    print()
 
 
 def return_kept(student, expert):
@@ -2493,6 +2513,10 @@ def make_parser():
 
 def run_command(parser, argv=None):
     """Run a command line; returns the exit status: 2, with one line, for what the user can mend."""
+    while (fd := os.open(os.devnull, os.O_RDWR)) < 3:  # a closed stream, whose place no file takes
+        os.set_inheritable(fd, True)
+    os.close(fd)
+    sys.stdout, sys.stderr = (s or open(os.devnull, "w") for s in (sys.stdout, sys.stderr))
     args = parser.parse_args(argv)
     warnings.simplefilter("ignore", RuntimeWarning)  # what isn't finite is refused in one line
     if hasattr(sys.stdout, "reconfigure"):  # a terminal that has no ±

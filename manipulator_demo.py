@@ -389,7 +389,7 @@ def command_demo(args):
     print_comparison(args, runs, result)
     print_appendix(result)
     if args.figure:
-        draw_figure(args.figure, runs, goal_map(np.random.default_rng([args.seed, 2])))
+        fac.drawn(draw_figure, args.figure, runs, goal_map(np.random.default_rng([args.seed, 2])))
     settings = {k: v for k, v in vars(args).items() if k != "run"}
     return {**result, "settings": settings, "cores": fac.cores()}
 

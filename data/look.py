@@ -240,7 +240,7 @@ def command_figure9(args):
             if t in pictures:
                 ax.imshow(pictures[t])
                 ax.set_title(f"decision {t}")
-    fac.save_figure(args.out, figure)
+    fac.drawn(fac.save_figure, args.out, figure)
     result = {"out": args.out, "task": task, "episodes": args.episodes, "silhouette": apart,
               "silhouette_shuffled": shuffled, "return_best": float(returns.max()),
               "return_worst": float(returns.min()), "moments": moments,
@@ -300,7 +300,7 @@ def command_agreement(args):
     ax.set(xlabel="decision", ylabel="rank correlation with the expert's Q", ylim=(None, 1),
            title=f"{task}, the worst of {args.episodes} episodes: {rewards[worst].sum():.0f}")
     ax.legend(ncols=1 + len(own) // 8)
-    fac.save_figure(args.out, figure)
+    fac.drawn(fac.save_figure, args.out, figure)
     result = {"out": args.out, "task": task, "held_out": known.mean(1).tolist(),
               "worst_episode": own.mean(1).tolist(), "when": when.tolist(),
               "return_worst": float(rewards[worst].sum()), "plan_gain": gain,

@@ -203,7 +203,7 @@ def command_table3(args):
               "cores": fac.cores()}
     print_benchmark(result, args.robots)
     if args.figure:
-        draw_prediction(args.figure, prediction, args.robots)
+        fac.drawn(draw_prediction, args.figure, prediction, args.robots)
     return result
 
 

@@ -617,21 +617,17 @@ def export(training, out, result):
         result["lag"] = {str(p): lag(training.curve, p / 100) for p in (50, 75, 90)}
         if args.episodes:
             result["ratio"] = fac.return_kept(result["student_return_mean"], result["return_mean"])
-    drawn = draw(out / "curve.png", training.curve, f"{args.task}, seed {args.seed}")
+    fac.drawn(draw, out / "curve.png", training.curve, f"{args.task}, seed {args.seed}")
     print(f"\n{args.task}: {training.decisions:,} decisions, {result['updates']:,} updates, "
           f"{training.seconds / 60:.1f} minutes; {args.episodes} evaluation episodes\n")
     fac.print_table(rows)
-    print(f"\n{out}/" + ("" if drawn else
-                         "\n(no picture: pip install 'fac-tdmpc-ref[plots]' draws curve.png)"))
+    print(f"\n{out}/")
     return result
 
 
 def draw(path, curve, title):
-    """Returns over the decisions; False where matplotlib is missing."""
-    try:
-        plt = fac.pyplot()
-    except fac.UserError:
-        return False
+    """Returns over the decisions."""
+    plt = fac.pyplot()
     figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
     for key, label, style in (("return_mean", "training episodes", {"alpha": 0.5}),
                               ("eval_expert", "expert", {"marker": "o"}),
@@ -642,7 +638,6 @@ def draw(path, curve, title):
     axes.set(xlabel="decisions (two environment steps each)", ylabel="return", title=title)
     axes.legend()
     fac.save_figure(path, figure)
-    return True
 
 
 def make_parser():

@@ -445,6 +445,61 @@ def test_distill_shows_its_progress(distilled):
     assert "Traceback" not in done.stderr and "Warning" not in done.stderr
 
 
+@pytest.mark.skipif(not importlib.util.find_spec("matplotlib"), reason="no matplotlib")
+@pytest.mark.parametrize("broken", [False, True])
+def test_a_picture_costs_no_result(tmp_path, files, broken):
+    """A notebook's backend and a user's LaTeX are theirs; what else goes wrong is said."""
+    (tmp_path / "matplotlibrc").write_text("text.usetex: True\n")
+    (tmp_path / "at" / "matplotlib").mkdir(parents=True)
+    (tmp_path / "at" / "matplotlib" / "__init__.py").write_text("raise OSError('no\\nhome')")
+    env = {"MPLBACKEND": "module://nobody_has.this", "MATPLOTLIBRC": str(tmp_path / "matplotlibrc"),
+           "PATH": "/nowhere", **({"PYTHONPATH": str(tmp_path / "at")} if broken else {})}
+    done = run(*distill_arguments(files, "--out", "out", "--workers", "0"), cwd=tmp_path,
+               env={**ONE_THREAD, **env})
+    assert "return kept" in succeeded(done).stdout
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert result["picture"] == (not broken) == (tmp_path / "out" / "curve.png").exists()
+    assert ("curve.png: no picture: no home\n" in done.stderr) == broken
+
+
+def test_the_time_of_all_is_that_of_distilling_and_more(tmp_path, files, no_plots):
+    """Of a run that is given again, or was cut off, too."""
+    arguments = *distill_arguments(files, "--out", "out", "--workers", "0"), "--json"
+    first = last_json(run(*arguments, cwd=tmp_path, env=no_plots))
+    assert first["seconds_total"] >= first["seconds"]
+    header, arrays = fac.read_npz(path := tmp_path / "out" / "checkpoint.npz", ("checkpoint",))
+    fac.write_npz(path, {**header, "seconds": 5000.0}, arrays)
+    again = last_json(run(*arguments, cwd=tmp_path, env=no_plots))
+    assert 5000 <= again["seconds"] < again["seconds_total"] < 5000 + 120
+
+
+@pytest.mark.parametrize("closed", ["2>&-", ">&-", "<&- >&- 2>&-"])
+def test_streams_may_be_closed(tmp_path, files, closed):
+    """As by a daemon: files are written, by workers' work, too; a fault is still a status of 2."""
+    def shell(*arguments):
+        command = f'"$0" "$@" {closed}'
+        return subprocess.run(["sh", "-c", command, sys.executable, *map(str, arguments)],
+                              cwd=tmp_path, env={**os.environ, **ONE_THREAD}, timeout=120,
+                              capture_output=True, text=True)
+
+    (tmp_path / "expert.npz").write_bytes((files / "expert.npz").read_bytes())
+    done = shell(SCRIPT, "evaluate", "--model", "expert.npz", "--episodes", "2", "--workers", "1",
+                 "--record", *BUDGET)
+    assert done.returncode == 0, done.stderr
+    assert len(fac.read_records(tmp_path / "expert.npz")) == 1
+    done = shell(SCRIPT, "evaluate", "--model", "none.npz")
+    assert done.returncode == 2 and "Error" not in done.stdout + done.stderr
+
+
+def test_progress_goes_to_whatever_stands_for_stderr(monkeypatch):
+    written = []
+    for stream in (None, SimpleNamespace(write=written.append, flush=lambda: None)):
+        monkeypatch.setattr(sys, "stderr", stream)
+        with fac.progress("playing", 3, "decision") as bar:
+            bar.update(3)
+    assert "playing" in "".join(written)
+
+
 def test_distill_writes_its_results_and_nothing_else(distilled):
     done, folder = distilled
     pictures = ["curve.png"] if importlib.util.find_spec("matplotlib") else []
@@ -782,7 +837,7 @@ def test_recorded_returns_stand_for_the_expert_in_distill(tmp_path, files, no_pl
     assert result["expert_returns"] == measured["returns"][:1]
     assert "expert (recorded)" in done.stdout and "student, N = 1" in done.stdout
     assert "evaluating the expert" not in done.stderr
-    assert "pip install 'fac-tdmpc-ref[plots]'" in done.stdout
+    assert "curve.png: no picture: this needs matplotlib: pip install" in done.stderr
     assert not (tmp_path / "out" / "curve.png").exists()
     with pytest.raises(ValueError):
         json.loads(done.stdout.splitlines()[-1])
