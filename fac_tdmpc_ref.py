@@ -1046,7 +1046,7 @@ def compact(rows):
     with np.errstate(all="ignore"):  # what is too large is infinite
         half = rows.astype(np.float16)
         apart, error = rows - rows[:1], half - rows
-    good = (error - error[:1]).std(0, dtype=float) <= 0.01 * apart.std(0, dtype=float)
+        good = (error - error[:1]).std(0, dtype=float) <= 0.01 * apart.std(0, dtype=float)
     return half if good.all() else rows
 
 
@@ -1690,15 +1690,14 @@ def robot_step(robot, action, sizes, t):
     """Decision t of an episode: next observation (O,), reward, whether it is over. What goes to and
     fro is copied. A robot's third value, if any, tells the end, or dm_control's reward of None: the
     next episode has begun, and all of this is none of ours. UserError: what isn't finite."""
-    found = robot.step(np.array(action))
-    need(isinstance(found, (tuple, list)) and len(found) in (2, 3), f"decision {t}: expected of "
-         "step(action) (observation, reward), perhaps a third, whether the episode is over")
-    if found[1] is None and t:
+    obs, reward, *over = robot.step(np.array(action))
+    need(len(over) < 2, f"decision {t}: expected (observation, reward), or a third, the end")
+    if reward is None and t:
         return None, None, True
-    reward = np.ravel(np.asarray(found[1], float))  # None is NaN
-    need(reward.size == 1 and np.isfinite(reward[0]), f"decision {t}: expected a finite reward, "
-         f"found {found[1]!r}")
-    return observed(found[0], sizes, f"decision {t}: observation"), reward.item(), any(found[2:])
+    reward = np.asarray(reward, float)  # None is NaN
+    need(reward.size == 1 and np.isfinite(reward).all(), f"decision {t}: expected a finite reward, "
+         f"found {reward}")
+    return observed(obs, sizes, f"decision {t}: observation"), reward.item(), any(over)
 
 
 def lookup_task(task):
@@ -1827,9 +1826,10 @@ def load_model(path, kinds=("expert", "student")):
             on_disk = on_disk[1:] if expected[0] == 1 else on_disk
             value = arrays.pop(key, None)
             need(value is not None, f"{path}: {key}: missing; expected float32 {on_disk}")
-            need((value.shape, value.dtype) == (on_disk, F32),
-                 f"{path}: {key}: expected float32 {on_disk}, found {value.dtype} {value.shape}; "
-                 f"the header's sizes and the weights disagree")
+            need(value.shape == on_disk, f"{path}: {key}: expected float32 {on_disk}, found "
+                 f"{value.dtype} {value.shape}; the header's sizes and the weights disagree")
+            need(value.dtype == F32, f"{path}: {key}: expected float32, found {value.dtype}; "
+                 "data/import_expert.py converts it")
             need(np.isfinite(value).all(), f"{path}: {key}: holds values that are not finite")
             params[key] = np.ascontiguousarray(value.reshape(expected))
     need(not arrays, f"{path}: {next(iter(arrays), None)}: unknown entry; expected TD-MPC's "
@@ -1855,45 +1855,55 @@ def made_for(header, where):
     return found
 
 
+def check_rows(name, rows, most=None):
+    """UserError names the first of rows (M, F) with a value that isn't finite, or above `most`."""
+    for i, j in np.argwhere(~(np.abs(rows) <= (most or np.finfo(rows.dtype).max)))[:1]:
+        raise UserError(f"{name}: row {i}, column {j}: found {rows[i, j]}, " + (
+            "outside [-1, 1]; scale it" if np.isfinite(rows[i, j]) else "not finite; leave it out"))
+
+
 class Replay:
     """The dataset of Algorithm 1 [D6]: transitions in order, episode after episode.
 
-    observation (M, O) and action (M, A) float16, continues (M,): False in an episode's last
-    row, whose action stands for nothing. Raises UserError for anything else."""
+    observation (M, O) and action (M, A) float16 or float32, continues (M,): False in an episode's
+    last row, whose action stands for nothing. Raises UserError for anything else."""
 
     def __init__(self, path):
         self.path = path
         self.header, arrays = read_npz(path, ("replay",))
-        for key, rank, dtype in (("observation", 2, np.float16), ("action", 2, np.float16),
-                                 ("continues", 1, np.bool_)):
+        for key, rank, kinds in (("observation", 2, "float16, float32"), ("continues", 1, "bool"),
+                                 ("action", 2, "float16, float32")):
             value = arrays.get(key, np.zeros(0, object))
-            need((value.ndim, value.dtype) == (rank, dtype)
+            need(value.ndim == rank and str(value.dtype) in kinds.split(", ")
                  and len(value) == len(arrays["observation"]),
-                 f"{path}: {key}: expected {dtype.__name__} of rank {rank} with a row for each "
+                 f"{path}: {key}: expected {kinds} of rank {rank} with a row for each "
                  f"transition, found {f'{value.dtype} {value.shape}' if value.size else 'nothing'}")
-            need((np.abs(value) <= (1 if key == "action" else 65504)).all(), f"{path}: {key}: "
-                 "holds values that are not finite, or actions outside [-1, 1]")
+            if rank == 2:
+                check_rows(f"{path}: {key}", value, 1 if key == "action" else None)
         self.observation, self.action = arrays["observation"], arrays["action"]
         self.ends = np.flatnonzero(~arrays["continues"])
         self.dim_obs, self.dim_action = self.observation.shape[1], self.action.shape[1]
         self.transitions = len(self.observation) - len(self.ends)
         need(self.ends[-1:].tolist() == [len(self.observation) - 1],
-             f"{path}: continues: expected False in the last row")
+             f"{path}: continues: expected False in the last row, {len(self.observation) - 1}")
 
     def starts(self, length, held_out, seed=0):
         """Rows from which `length` actions stay in their episode: (training, held-out) rows.
 
-        Every (1 / held_out)-th episode is held out, early and late ones, which ones by the seed.
-        UserError: too few."""
-        every = max(2, round(1 / held_out))
-        training, held = [], []
-        for i, (begin, end) in enumerate(zip(np.r_[0, self.ends + 1], self.ends)):
-            into = held if (i + 1 - seed) % every == 0 else training
-            into.append(np.arange(begin, end - length + 1))
-        need(sum(map(len, training)) and sum(map(len, held)),
-             f"{self.path}: {len(self.ends)} episodes are too few to hold out a share of "
-             f"{held_out} and sample {length} actions in a row; collect more, or hold out more")
-        return np.concatenate(training), np.concatenate(held)
+        Every (1 / held_out)-th episode is held out, early and late ones, which ones by the seed; of
+        fewer one, of a single one its end. UserError: too short."""
+        begins, ends = np.r_[0, self.ends[:-1] + 1], self.ends
+        if len(ends) == 1:  # as two, of which the second is held out
+            cut = max(0, ends[0] - max(length, round(held_out * ends[0])))
+            begins, ends, seed = [0, cut], [cut, ends[0]], 0
+        parts = [np.arange(begin, end - length + 1) for begin, end in zip(begins, ends)]
+        rows, episode = np.concatenate(parts), np.repeat(np.arange(len(ends)), [*map(len, parts)])
+        for every in range(max(2, round(1 / held_out)), 1, -1):
+            held = (episode + 1 - seed) % every == 0
+            if 0 < held.sum() < len(rows):
+                return rows[~held], rows[held]
+        raise UserError(f"{self.path}: expected two episodes of at least {length} actions (horizon "
+                        f"+ 1), or one of {2 * length}; give longer ones, or lower the horizon")
 
     def sequences(self, starts, length):
         """First observations (O, B) and actions (L, A, B), float32, from the rows `starts` on."""

@@ -191,15 +191,15 @@ class ReplayBuffer:
         held = np.arange(self.count - len(self), self.count) % len(self.reward)
         count = min(episodes or len(held), len(held))
         order = held[::-1][np.arange(count) * len(held) // count][::-1]
-        action = np.zeros((len(order), self.steps + 1, self.action.shape[2]), np.float16)
+        action = np.zeros((len(order), self.steps + 1, self.action.shape[2]), np.float32)
         action[:, :-1] = self.action[order]
         continues = np.ones(action.shape[:2], bool)
         continues[:, -1] = False
         observation = self.observation[order].reshape(-1, self.observation.shape[2])
         spread_targets(header["task"], observation, fac.stream(0, "replay targets"))
         fac.write_npz(path, {"kind": "replay", **header}, {
-            "observation": observation.astype(np.float16),
-            "action": action.reshape(-1, action.shape[2]), "continues": continues.ravel()},
+            "observation": fac.compact(observation), "continues": continues.ravel(),
+            "action": fac.compact(action.reshape(-1, action.shape[2]))},
             compress=True)
 
 

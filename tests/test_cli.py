@@ -283,7 +283,7 @@ def refused(done, *parts, program="fac_tdmpc_ref.py"):
     (["--expert-episodes", "1", "--played-share", "0"], ["played_share", "above 0", "not 0.0"]),
     (["--encoder-input", "observation"], ["no policy", "--plan-prior none"]),
     (["--held-out", "1"], ["held_out", "at least 0.0001 and at most 0.5"]),
-    (["--held-out", "0.05"], ["replay.npz", "6 episodes are too few"]),
+    (["--horizon", "40"], ["replay.npz", "two episodes of at least 41 actions"]),
     (["--kl", "sideways"], ["--kl", "'sideways'", "forward"]),
     (["--plan-horizon", "0"], ["--plan-horizon"]),
     (["--plan-min-std", "3"], ["min_std", "max_std"]),
