@@ -1042,8 +1042,8 @@ def one_thread():
 def compact(rows):
     """Rows (M, F) in float16, which is half as much; in float32 where that would move a feature by
     more than a hundredth of its deviation, as one with an offset or a tiny scale."""
-    rows = np.asarray(rows, F32)
     with np.errstate(all="ignore"):  # what is too large is infinite
+        rows = np.asarray(rows, F32)
         half = rows.astype(np.float16)
         apart, error = rows - rows[:1], half - rows
         good = (error - error[:1]).std(0, dtype=float) <= 0.01 * apart.std(0, dtype=float)
