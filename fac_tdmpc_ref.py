@@ -1659,7 +1659,7 @@ class Environment:
         if domain == "reacher":
             need(REACHER.exists(), f"{REACHER}: no such file; run from a clone of the repository")
             self.env = control.Environment(
-                reacher.Physics.from_xml_path(str(REACHER)),
+                reacher.Physics.from_xml_string(REACHER.read_text("ascii")),
                 reacher.Reacher(REACHER_TARGET[name], random=0), time_limit=20)
         else:
             self.env = suite.load(domain, name, task_kwargs={"random": 0})
@@ -1729,19 +1729,17 @@ FORMAT = "fac-tdmpc-ref 1"
 @contextlib.contextmanager
 def atomic_file(path, mode="wb", **options):
     """A file that appears under its name only when it is complete; UserError if it can't."""
-    path, temporary = Path(path), None
+    path, temporary = Path(path), Path(f"{Path(path)}{os.urandom(4).hex()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(prefix=path.name, suffix=".tmp", dir=path.parent)
-        with os.fdopen(handle, mode, **options) as file:
+        with open(temporary, mode.replace("w", "x"), **options) as file:  # readable as umask says
             yield file
-        os.chmod(temporary, 0o644)
         os.replace(temporary, path)
     except OSError as error:
         raise UserError(f"{path}: can't be written: {error.strerror or error}") from error
     finally:
-        if temporary:
-            Path(temporary).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
 
 
 def check_writable(path):

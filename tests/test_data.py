@@ -581,6 +581,16 @@ def test_a_file_appears_complete_and_readable_by_all(tmp_path):
     assert path.stat().st_mode & 0o777 == 0o644
 
 
+@pytest.mark.parametrize("mask", [0o077, 0o002])
+def test_files_follow_the_umask(tmp_path, mask):
+    before = os.umask(mask)
+    try:
+        fac.write_json(tmp_path / "x.json", {})
+    finally:
+        os.umask(before)
+    assert (tmp_path / "x.json").stat().st_mode & 0o777 == 0o666 & ~mask
+
+
 def test_the_old_file_is_there_until_the_new_one_is(old_file):
     with fac.atomic_file(old_file, "w", newline="") as file:
         file.write("new\n")
@@ -597,13 +607,13 @@ def test_a_writer_that_fails_changes_nothing(old_file, error):
     assert untouched(old_file)
 
 
-@pytest.mark.parametrize("name", ["mkstemp", "replace"])
+@pytest.mark.parametrize("name", ["open", "replace"])
 def test_a_folder_that_can_not_be_written(old_file, monkeypatch, name):
     """Read-only, as the system would say it: permissions don't bind the superuser."""
     def refused(*_, **__):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
-    monkeypatch.setattr(fac.tempfile if name == "mkstemp" else fac.os, name, refused)
+    monkeypatch.setattr(fac if name == "open" else fac.os, name, refused, raising=False)
     refusal(lambda: fac.write_npz(old_file, {}, {}), old_file, "can't be written",
             "Permission denied")
     assert untouched(old_file)
