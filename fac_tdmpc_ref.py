@@ -708,7 +708,6 @@ import contextlib
 import csv
 import difflib
 import importlib.metadata
-import io
 import itertools
 import json
 import math
@@ -1034,20 +1033,21 @@ def keep_memory():
     np.empty(1 << 22, F32)
 
 
+@contextlib.contextmanager
 def one_thread():
-    """A context in which BLAS uses one thread: more would change bits, and cores are for agents."""
-    return _thread_pools().limit(limits=1, user_api="blas")
+    """Inside, BLAS uses one thread: more would change bits, and cores are for agents. And NumPy,
+    however a caller has set it, goes on where an exp underflows."""
+    with _thread_pools().limit(limits=1, user_api="blas"), np.errstate(all="ignore"):
+        yield
 
 
 def compact(rows):
-    """Rows (M, F) in float16, which is half as much; in float32 where that would move a feature by
-    more than a hundredth of its deviation, as one with an offset or a tiny scale."""
+    """Rows (M, F) in float16; float32 where that moves a feature by above 1% of its deviation."""
     with np.errstate(all="ignore"):  # what is too large is infinite
         rows = np.asarray(rows, F32)
         half = rows.astype(np.float16)
-        apart, error = rows - rows[:1], half - rows
-        good = (error - error[:1]).std(0, dtype=float) <= 0.01 * apart.std(0, dtype=float)
-    return half if good.all() else rows
+        moved, apart = ((x - x[:1]).std(0, dtype=float) for x in (half - rows, rows))
+    return half if (moved <= 0.01 * apart).all() else rows
 
 
 POOL, PART = 4096, 64  # states that the expert predicts at once, and a thread's part of them
@@ -1093,7 +1093,7 @@ class Distiller:
         with one_thread():
             self.optimizer, self.student = new_student(expert, sizes, seed)
         self._number = None
-        self._threads = ThreadPoolExecutor(2)
+        self._threads = ThreadPoolExecutor(2, "", functools.partial(np.seterr, all="ignore"))
         self._halves = [flatten({k: np.zeros_like(v) for k, v in self.optimizer.params.items()})
                         for _ in range(2)]  # each thread's gradient: a vector, its parts by name
 
@@ -1172,8 +1172,7 @@ class Distiller:
         good = np.isfinite(observation).all(2) & (np.abs(action) <= 1).all(2)
         past = np.logical_and.accumulate(np.isnan(episodes).all(2)[:, ::-1], 1)[:, ::-1]
         for e, t in np.argwhere(~(good | past))[:1]:
-            raise UserError(f"played episodes: not finite, or an action outside [-1, 1]: decision "
-                            f"{t} of episode {e}")
+            raise UserError(f"played episodes: {e}, decision {t}: not finite, or outside [-1, 1]")
         long = good.sum(1) >= L
         need(long.any(), f"played episodes: none has {L} decisions, one more than the horizon")
         self.played = np.concatenate([self.played, compact(episodes[long][good[long]])])
@@ -1409,8 +1408,7 @@ class FastPlanner(AgentPlanner):
         return self.fast.start(z, self.config) if self.fast else super().returns(z)
 
     def search(self, z, mean):
-        with np.errstate(invalid="ignore"):
-            mean, elites, scores = super().search(z, mean)
+        mean, elites, scores = super().search(z, mean)
         need(scores is None or np.isfinite(scores).all(), "planning: no action sequence has a "
              "finite return; the model's weights or the observation are far out of range")
         return mean, elites, scores
@@ -1447,12 +1445,10 @@ def useful_workers(agents):
 
 
 def observed(obs, sizes, what="observation"):
-    """A copy of an observation, float32 (O,), for a robot may use its array again. UserError: of
-    another shape than a model's `sizes` say, or not finite."""
+    """A copy, float32 (O,): a robot may use its array again. UserError: other shape, not finite."""
     shape = (sizes.dim_obs,)
     try:
-        with np.errstate(over="ignore"):
-            obs = np.array(obs, F32)
+        obs = np.array(obs, F32)
     except (TypeError, ValueError):
         raise UserError(f"{what}: expected numbers of shape {shape}, found what NumPy makes no "
                         "array of them of") from None
@@ -1541,6 +1537,8 @@ class Workers(contextlib.AbstractContextManager):
 
     def __init__(self, target, count, name="worker"):
         context, self._name, self._members = multiprocessing.get_context("spawn"), name, []
+        if getattr(main := sys.modules["__main__"], "__file__", "") == "<stdin>":
+            del main.__file__  # or children look for it
         for _ in range(count):
             here, there = context.Pipe()
             process = context.Process(target=_run_worker, args=(target, there), daemon=True)
@@ -1619,24 +1617,12 @@ REACHER_TARGET = {"easy": 0.05, "hard": 0.015}  # radius of the target, metres
 REACHER = DATA / "reacher.xml"  # three links; dm_control's has two
 
 
-@contextlib.contextmanager
-def variable(name, value):
-    """The process's variable `name` has this value inside; what it had, or none, behind."""
-    before = os.environ.get(name)
-    try:
-        os.environ.update({} if value is None else {name: value})
-        yield
-    finally:
-        os.environ.pop(name, None)
-        os.environ.update({} if before is None else {name: before})
-
-
 class Environment:
     """One of the paper's 11 tasks. MuJoCo is imported here and nowhere else.
 
     Observations are dm_control's dict, concatenated in its own order, float32 (dim O,).
     Actions (dim A,) in [-1, 1] are scaled to the action spec and applied `action_repeat` times.
-    render: whether `env.physics.render` is wanted, which the first of a process decides. Raises
+    render: whether `env.physics.render` will draw, which the first of a process decides. Raises
     UserError for an unknown task or an installation that dm_control can't work with."""
 
     def __init__(self, task, action_repeat=ACTION_REPEAT, render=False):
@@ -1645,17 +1631,19 @@ class Environment:
         backend = os.environ.get("MUJOCO_GL")
         try:
             import mujoco  # noqa: F401  (whose own renderer is the caller's)
-            with variable("MUJOCO_GL", backend if backend or render else "disable"):
-                from dm_control import _render, suite  # for states only it needs no display
-                from dm_control.rl import control
-                from dm_control.suite import reacher
+            if backend is None and not render:
+                os.environ["MUJOCO_GL"] = "disable"  # states only: dm_control needs no display
+            from dm_control import suite
+            from dm_control.rl import control
+            from dm_control.suite import reacher
         except (ImportError, RuntimeError, AttributeError) as error:
             raise UserError(
                 f"dm_control does not import ({error}); it needs mujoco==3.17.0 beside "
                 f"dm-control==1.0.50, and MUJOCO_GL unset or one of egl, osmesa, disable "
                 f"(it is {backend!r})") from error
-        need(not render or _render.BACKEND not in (None, "off"), "render=True: nothing draws "
-             "here; make the process's first Environment so, with MUJOCO_GL unset, egl or osmesa")
+        finally:
+            if backend is None:
+                os.environ.pop("MUJOCO_GL", None)
         if domain == "reacher":
             need(REACHER.exists(), f"{REACHER}: no such file; run from a clone of the repository")
             self.env = control.Environment(
@@ -1856,8 +1844,8 @@ def made_for(header, where):
 def check_rows(name, rows, most=None):
     """UserError names the first of rows (M, F) with a value that isn't finite, or above `most`."""
     for i, j in np.argwhere(~(np.abs(rows) <= (most or np.finfo(rows.dtype).max)))[:1]:
-        raise UserError(f"{name}: row {i}, column {j}: found {rows[i, j]}, " + (
-            "outside [-1, 1]; scale it" if np.isfinite(rows[i, j]) else "not finite; leave it out"))
+        wrong = "outside [-1, 1]" if np.isfinite(rows[i, j]) else "not finite"
+        raise UserError(f"{name}: row {i}, column {j}: {rows[i, j]} is {wrong}; mend or drop it")
 
 
 class Replay:
@@ -2022,10 +2010,9 @@ def check_task(sizes, task, what="the model"):
 def progress(label, total, unit, initial=0):
     """A progress bar on stderr with rate and remaining time."""
     from tqdm import tqdm
-    return tqdm(desc=label, total=total, initial=initial, unit=unit,
-                file=sys.stderr or io.StringIO(),  # or it is closed
-                dynamic_ncols=True, smoothing=0.1, leave=None,  # one below another vanishes
-                mininterval=0.5 if os.isatty(2) else 20)
+    return tqdm(desc=label, total=total, initial=initial, unit=unit, dynamic_ncols=True,
+                file=sys.stderr or open(os.devnull, "w"), mininterval=0.5 if os.isatty(2) else 20,
+                smoothing=0.1, leave=None)  # one below another vanishes
 
 
 def interleaved_seconds(calls, rounds, label):
@@ -2060,7 +2047,8 @@ def train_student(distiller, out, settings, planning, workers):
     """Algorithm 1 to its end, with a learning curve and checkpoints in the folder `out`.
 
     A run that was cut off goes on from its checkpoint to the same end (UserError: it is damaged, or
-    another run's). Returns (curve rows, seconds). workers: that play the expert's episodes [D8]."""
+    another run's). Returns (curve rows, seconds, those before it went on). workers: that play the
+    expert's episodes [D8]."""
     checkpoint, config, curve, before = out / "checkpoint.npz", distiller.config, [], 0.0
     if checkpoint.exists():
         header, arrays = read_npz(checkpoint, ("checkpoint",))
@@ -2095,7 +2083,7 @@ def train_student(distiller, out, settings, planning, workers):
                 write_npz(checkpoint, {"kind": "checkpoint", "settings": settings, "curve": curve,
                                        "seconds": seconds}, distiller.state())
                 saved = time.time()
-    return curve, before + time.time() - began
+    return curve, before + time.time() - began, before
 
 
 def same_settings(found, expected, where, group=""):
@@ -2134,7 +2122,8 @@ def optional(library, extra):
 
 def pyplot():
     """matplotlib.pyplot, in this project's style, without a display; UserError if missing."""
-    with optional("matplotlib", "plots"), variable("MPLBACKEND", "Agg"):  # a notebook's is its own
+    os.environ.pop("MPLBACKEND", None)  # a notebook's, which may not be here
+    with optional("matplotlib", "plots"):
         import matplotlib
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
@@ -2290,9 +2279,7 @@ def distil_and_save(distiller, args, planning, header, out):
     print(f"{args.task}: {student.config.num_agents} agents, {len(distiller.optimizer.vector):,} "
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
-    began, (curve, seconds) = time.time(), train_student(distiller, out, settings, planning,
-                                                         args.workers)
-    before = seconds - (time.time() - began)  # in runs of this command that were cut off, or done
+    curve, seconds, before = train_student(distiller, out, settings, planning, args.workers)
     width, gains = planning.max_std, None
     if planning.prior == "policy" and getattr(args, "PlannerConfig.max_std") is None:
         width, gains = search_width(distiller, planning)
@@ -2303,9 +2290,8 @@ def distil_and_save(distiller, args, planning, header, out):
     write_json(out / "config.json", {**settings, "planner": asdict(planning)})
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
             "steps": config.steps, "seconds": round(seconds, 1), "seconds_total": before,
-            "kl_reward": curve[-1][3], "kl_value": curve[-1][4],
-            **rank_results(distiller, 256, planning.discount),
-            "search_width": width, "plan_gains": gains, "out": str(out),
+            "kl_reward": curve[-1][3], "kl_value": curve[-1][4], "search_width": width,
+            "plan_gains": gains, **rank_results(distiller, 256, planning.discount), "out": str(out),
             "picture": drawn(draw_curve, out / "curve.png", curve,
                              f"{args.task}, seed {args.seed}")}, planning
 
@@ -2384,7 +2370,6 @@ def report(result, plannings, eval_seed):
         if width == result["search_width"]:
             print(f"plans around the policy, deviation {width}: {gain:.2f} ± {se:.2f} above it by "
                   f"the expert's G in held-out states, {promise:.2f} by the student's")
-    print()
 
 
 def return_kept(student, expert):
@@ -2521,10 +2506,8 @@ def make_parser():
 
 def run_command(parser, argv=None):
     """Run a command line; returns the exit status: 2, with one line, for what the user can mend."""
-    while (fd := os.open(os.devnull, os.O_RDWR)) < 3:  # a closed stream, whose place no file takes
-        os.set_inheritable(fd, True)
-    os.close(fd)
-    sys.stdout, sys.stderr = (s or open(os.devnull, "w") for s in (sys.stdout, sys.stderr))
+    sys.stdin, sys.stdout, sys.stderr = (stream or open(os.devnull, "r+") for stream in (
+        sys.stdin, sys.stdout, sys.stderr))  # a closed one's number is not for the next file
     args = parser.parse_args(argv)
     warnings.simplefilter("ignore", RuntimeWarning)  # what isn't finite is refused in one line
     if hasattr(sys.stdout, "reconfigure"):  # a terminal that has no ±

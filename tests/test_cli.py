@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -489,6 +490,61 @@ def test_streams_may_be_closed(tmp_path, files, closed):
     assert len(fac.read_records(tmp_path / "expert.npz")) == 1
     done = shell(SCRIPT, "evaluate", "--model", "none.npz")
     assert done.returncode == 2 and "Error" not in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("program", ["manipulator_demo.py", *(f"data/{name}.py" for name in (
+    "experiments", "export_golden", "import_expert", "train_expert"))])
+def test_programs_find_this_module_under_pythonsafepath(tmp_path, program):
+    code = (f"import runpy, sys; sys.argv = ['x', '--help']\n"
+            f"try: runpy.run_path({str(ROOT / program)!r}, run_name='__main__')\n"
+            f"except SystemExit as end: assert not end.code\n"
+            f"assert sys.modules['fac_tdmpc_ref'].__file__ == {str(SCRIPT)!r}")
+    succeeded(launch(["-c", code], tmp_path, {"PYTHONSAFEPATH": "1"}))
+
+
+def test_a_folder_whose_name_is_not_ascii(tmp_path, files):
+    """Under a locale that can't say it, too."""
+    (folder := tmp_path / "h\u00e9 \u5b66" / "data").mkdir(parents=True)
+    for path in (SCRIPT, ROOT / "data" / "reacher.xml"):
+        (folder.parent / path.relative_to(ROOT)).write_bytes(path.read_bytes())
+    for name in ("expert", "replay"):
+        (folder / f"{name}.npz").write_bytes((files / f"{name}.npz").read_bytes())
+    for env in ({}, {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}):
+        done = launch([folder.parent / SCRIPT.name, "evaluate", "--model", folder / "expert.npz",
+                       "--episodes", "1", "--workers", "1", *BUDGET], tmp_path,
+                      {**ONE_THREAD, "PYTHONIOENCODING": "", **env})
+        assert "reacher-hard" in succeeded(done).stdout
+
+
+def test_numpy_may_be_set_to_raise(tmp_path, files):
+    """And Python's warnings to errors: planning and distilling go on where an exp underflows."""
+    expert, _ = fac.load_model(files / "expert.npz")
+    for key in expert.params:
+        expert.params[key] = 40 * expert.params[key]
+    config = fac.DistillConfig(steps=4, batch_size=4, horizon=1, held_out=0.34, expert_episodes=0,
+                               lr=1e-6)
+    with np.errstate(all="raise"), warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        fac.Planner(expert, fac.PlannerConfig(samples=8)).act(np.full(8, 1e3))
+        distiller = fac.Distiller(expert, fac.Replay(files / "replay.npz"), config)
+        for _ in distiller.run():
+            pass
+        fac.rank_results(distiller, 8, 0.99)
+        distiller.close()
+        assert fac.compact(np.array([[1e9], [1.0]])).dtype == np.float32
+        with pytest.raises(FloatingPointError):  # the caller's setting stays
+            np.exp(np.float32(-1e3))
+
+
+def test_a_script_on_standard_input_may_have_workers(tmp_path):
+    code = ("import numpy as np, fac_tdmpc_ref as fac\n"
+            "model = fac.WorldModel.create(fac.ModelConfig(8, 3, 3, 4, 8, 8), "
+            "np.random.default_rng(0))\n"
+            "with fac.Planner(model, fac.PlannerConfig(samples=8), workers=1) as planner:\n"
+            "    print(planner.act(np.zeros(8)).shape)\n")
+    done = subprocess.run([sys.executable, "-"], input=code, capture_output=True, text=True,
+                          cwd=ROOT, timeout=60, env={**os.environ, **ONE_THREAD})
+    assert succeeded(done).stdout == "(3,)\n"
 
 
 def test_progress_goes_to_whatever_stands_for_stderr(monkeypatch):

@@ -388,14 +388,14 @@ def test_replay_that_is_not_finite(tmp_path, key, bad):
     value = replay_arrays()[key]
     value[100, 1] = bad
     path = write_replay(tmp_path / "r.npz", **{key: value})
-    refusal(lambda: fac.Replay(path), path, f"{key}: row 100, column 1: found {bad}, not finite")
+    refusal(lambda: fac.Replay(path), path, f"{key}: row 100, column 1: {bad} is not finite")
 
 
 def test_replay_whose_actions_are_out_of_range(tmp_path):
     value = replay_arrays()["action"]
     value[100, 1] = -1.01
     path = write_replay(tmp_path / "r.npz", action=value)
-    refusal(lambda: fac.Replay(path), path, "action: row 100, column 1: found -1.00",
+    refusal(lambda: fac.Replay(path), path, "action: row 100, column 1: -1.00",
             "outside [-1, 1]")
 
 

@@ -225,9 +225,9 @@ def test_played_episodes_may_be_of_any_length(replay):
 
 
 @pytest.mark.parametrize("array, at, value, part", [
-    (1, (1, 6, 0), 1.02, "decision 6 of episode 1"), (0, (0, 2, 3), np.nan, "decision 2 of"),
-    (0, (0, 9, 0), np.inf, "decision 9 of episode 0"), (1, (1, 0, 0), -40, "outside [-1, 1]"),
-    (0, (slice(None), slice(3, 5)), np.nan, "decision 3 of episode 0"),
+    (1, (1, 6, 0), 1.02, "1, decision 6:"), (0, (0, 2, 3), np.nan, "0, decision 2:"),
+    (0, (0, 9, 0), np.inf, "0, decision 9:"), (1, (1, 0, 0), -40, "outside [-1, 1]"),
+    (0, (slice(None), slice(3, 5)), np.nan, "0, decision 3:"),
     (0, (slice(None), slice(3, 10)), np.nan, "none has 4 decisions")])
 def test_played_episodes_that_hold_anything_else_are_refused(replay, array, at, value, part):
     episodes = np.zeros((2, 10, 8)), np.zeros((2, 10, 3))
