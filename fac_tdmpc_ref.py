@@ -1033,9 +1033,21 @@ def keep_memory():
     np.empty(1 << 22, F32)
 
 
+@contextlib.contextmanager
 def one_thread():
-    """A context in which BLAS uses one thread: more would change bits, and cores are for agents."""
-    return _thread_pools().limit(limits=1, user_api="blas")
+    """Inside, BLAS uses one thread: more would change bits, and cores are for agents. And NumPy,
+    however a caller has set it, goes on where an exp underflows."""
+    with _thread_pools().limit(limits=1, user_api="blas"), np.errstate(all="ignore"):
+        yield
+
+
+def compact(rows):
+    """Rows (M, F) in float16; float32 where that moves a feature by above 1% of its deviation."""
+    with np.errstate(all="ignore"):  # what is too large is infinite
+        rows = np.asarray(rows, F32)
+        half = rows.astype(np.float16)
+        moved, apart = ((x - x[:1]).std(0, dtype=float) for x in (half - rows, rows))
+    return half if (moved <= 0.01 * apart).all() else rows
 
 
 POOL, PART = 4096, 64  # states that the expert predicts at once, and a thread's part of them
@@ -1066,7 +1078,8 @@ class Distiller:
              "--plan-prior none")
         need(theirs.num_agents == 1 or config.targets == "joint", f"the expert has "
              f"{theirs.num_agents} agents, credit is for one; pass --targets joint")
-        self.played = np.zeros((0, 0, replay.dim_obs + replay.dim_action), np.float16)
+        self.played = np.zeros((0, replay.dim_obs + replay.dim_action), np.float16)
+        self.lengths = np.zeros(0, np.int64)
         agents = theirs.dim_action if num_agents is None else num_agents
         needed = config.steps * config.batch_size // config.reuse
         self.pool_size = max(config.batch_size, min(POOL, needed))
@@ -1080,7 +1093,7 @@ class Distiller:
         with one_thread():
             self.optimizer, self.student = new_student(expert, sizes, seed)
         self._number = None
-        self._threads = ThreadPoolExecutor(2)
+        self._threads = ThreadPoolExecutor(2, "", functools.partial(np.seterr, all="ignore"))
         self._halves = [flatten({k: np.zeros_like(v) for k, v in self.optimizer.params.items()})
                         for _ in range(2)]  # each thread's gradient: a vector, its parts by name
 
@@ -1090,9 +1103,10 @@ class Distiller:
         obs, actions = self.replay.sequences(rng.choice(self.train_starts, size), L)
         is_played = len(self.played) and rng.random(size) < self.config.played_share
         if count := np.sum(is_played):
-            episode = rng.integers(len(self.played), size=count)
-            t = rng.integers(self.played.shape[1] - L + 1, size=count) + np.arange(L)[:, None]
-            seen, done = np.split(self.played[episode, t].swapaxes(1, 2).astype(F32),
+            episode = rng.integers(len(self.lengths), size=count)
+            t = rng.integers(self.lengths[episode] - L + 1) + np.arange(L)[:, None]
+            rows = (np.cumsum(self.lengths) - self.lengths)[episode] + t
+            seen, done = np.split(self.played[rows].swapaxes(1, 2).astype(F32),
                                   [self.replay.dim_obs], 1)
             obs[:, is_played], actions[:, :, is_played] = seen[0], done  # seen (L, O, count)
         if self.config.policy_share:
@@ -1152,22 +1166,28 @@ class Distiller:
         return self.optimizer.t
 
     def add(self, observation, action):
-        """Let episodes (E, T, O), (E, T, A) join `played` (all, T, O + A) [D8]; any T above H."""
-        episodes = np.concatenate([observation, action], 2)
-        need((np.abs(episodes) <= 65504).all(), "played episodes: not finite, or above 65504")
-        episodes = episodes.astype(np.float16)
-        self.played = np.concatenate([self.played, episodes]) if len(self.played) else episodes
+        """Let episodes (E, T, O), (E, T, A), NaN past their ends, join `played`, the rows
+        (all, O + A) of episodes of `lengths` [D8]; those of H decisions or fewer are left out."""
+        episodes, L = np.concatenate([observation, action], 2), self.config.horizon + 1
+        good = np.isfinite(observation).all(2) & (np.abs(action) <= 1).all(2)
+        past = np.logical_and.accumulate(np.isnan(episodes).all(2)[:, ::-1], 1)[:, ::-1]
+        for e, t in np.argwhere(~(good | past))[:1]:
+            raise UserError(f"played episodes: {e}, decision {t}: not finite, or outside [-1, 1]")
+        long = good.sum(1) >= L
+        need(long.any(), f"played episodes: none has {L} decisions, one more than the horizon")
+        self.played = np.concatenate([self.played, compact(episodes[long][good[long]])])
+        self.lengths = np.concatenate([self.lengths, good[long].sum(1)])
         self._number = None  # its pool is drawn again, with them
 
     def state(self):
         """Everything that a resumed run needs."""
-        return {**optimizer_state(self.optimizer), "played": self.played}
+        return {**optimizer_state(self.optimizer), "played": self.played, "lengths": self.lengths}
 
     def load(self, state):
         """Go on from a `state`."""
         load_optimizer(self.optimizer, state)
-        shape = *state["played"].shape[:2], self.played.shape[2]  # or it is another robot's
-        self.played, self._number = state["played"].reshape(shape), None
+        played = state["played"].reshape(-1, self.played.shape[1])  # or it is another robot's
+        self.played, self.lengths, self._number = played, state["lengths"], None
 
     def close(self):
         """Stop the threads."""
@@ -1388,8 +1408,7 @@ class FastPlanner(AgentPlanner):
         return self.fast.start(z, self.config) if self.fast else super().returns(z)
 
     def search(self, z, mean):
-        with np.errstate(invalid="ignore"):
-            mean, elites, scores = super().search(z, mean)
+        mean, elites, scores = super().search(z, mean)
         need(scores is None or np.isfinite(scores).all(), "planning: no action sequence has a "
              "finite return; the model's weights or the observation are far out of range")
         return mean, elites, scores
@@ -1423,6 +1442,19 @@ def cores():
 def useful_workers(agents):
     """As many processes beside this one as there are cores and agents for."""
     return min(agents, cores()) - 1
+
+
+def observed(obs, sizes, what="observation"):
+    """A copy, float32 (O,): a robot may use its array again. UserError: other shape, not finite."""
+    shape = (sizes.dim_obs,)
+    try:
+        obs = np.array(obs, F32)
+    except (TypeError, ValueError):
+        raise UserError(f"{what}: expected numbers of shape {shape}, found what NumPy makes no "
+                        "array of them of") from None
+    need(obs.shape == shape, f"{what}: expected shape {shape}, found {obs.shape}")
+    need(np.isfinite(obs).all(), f"{what}: holds values that are not finite")
+    return obs
 
 
 class Planner(contextlib.ExitStack):  # whose `close` ends the workers
@@ -1460,14 +1492,7 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
 
     def act(self, obs):
         """obs (O,) -> action (A,), float32 in [-1, 1]. UserError: other shape, NaN, no finite G."""
-        shape = (self.model.config.dim_obs,)
-        try:
-            obs = np.asarray(obs, F32)
-        except (TypeError, ValueError):
-            raise UserError(f"observation: expected numbers of shape {shape}, found what NumPy "
-                            "makes no array of them of") from None
-        need(obs.shape == shape, f"observation: expected shape {shape}, found {obs.shape}")
-        need(np.isfinite(obs).all(), "observation: holds values that are not finite")
+        obs = observed(obs, self.model.config)
         with one_thread():
             z, prior = self.model.encode(obs[:, None]), self._prior(obs)
             tasks = [(z[part], prior if prior is None else prior[part]) for part in self._parts]
@@ -1512,6 +1537,8 @@ class Workers(contextlib.AbstractContextManager):
 
     def __init__(self, target, count, name="worker"):
         context, self._name, self._members = multiprocessing.get_context("spawn"), name, []
+        if getattr(main := sys.modules["__main__"], "__file__", "") == "<stdin>":
+            del main.__file__  # or children look for it
         for _ in range(count):
             here, there = context.Pipe()
             process = context.Process(target=_run_worker, args=(target, there), daemon=True)
@@ -1590,10 +1617,14 @@ REACHER_TARGET = {"easy": 0.05, "hard": 0.015}  # radius of the target, metres
 REACHER = DATA / "reacher.xml"  # three links; dm_control's has two
 
 
-def import_dm_control():
-    """dm_control's suite, rl.control, suite.reacher. Nothing else here imports MuJoCo."""
-    os.environ.setdefault("MUJOCO_GL", "disable")  # states only: needs no display
+def import_dm_control(render=False):
+    """dm_control's suite, rl.control, suite.reacher. Nothing else here imports MuJoCo. The first
+    import of a process decides whether dm_control can draw."""
+    backend = os.environ.get("MUJOCO_GL")
     try:
+        import mujoco  # noqa: F401  (whose own renderer is the caller's)
+        if backend is None and not render:
+            os.environ["MUJOCO_GL"] = "disable"  # states only: dm_control needs no display
         from dm_control import suite
         from dm_control.rl import control
         from dm_control.suite import reacher
@@ -1601,7 +1632,10 @@ def import_dm_control():
         raise UserError(
             f"dm_control does not import ({error}); it needs mujoco==3.17.0 beside "
             f"dm-control==1.0.50, and MUJOCO_GL unset or one of egl, osmesa, disable "
-            f"(it is {os.environ['MUJOCO_GL']!r})") from error
+            f"(it is {backend!r})") from error
+    finally:
+        if backend is None:
+            os.environ.pop("MUJOCO_GL", None)
     return suite, control, reacher
 
 
@@ -1610,17 +1644,17 @@ class Environment:
 
     Observations are dm_control's dict, concatenated in its own order, float32 (dim O,).
     Actions (dim A,) in [-1, 1] are scaled to the action spec and applied `action_repeat` times.
-    Raises UserError for an unknown task or an installation that dm_control can't work with."""
+    render: whether `env.physics.render` will draw, which the first of a process decides. Raises
+    UserError for an unknown task or an installation that dm_control can't work with."""
 
-    def __init__(self, task, action_repeat=ACTION_REPEAT):
-        episode_steps(action_repeat)
-        self.action_repeat = action_repeat
+    def __init__(self, task, action_repeat=ACTION_REPEAT, render=False):
+        self.action_repeat, self.episode_steps = action_repeat, episode_steps(action_repeat)
         domain, name, self.dim_obs, self.dim_action = lookup_task(task)
-        suite, control, reacher = import_dm_control()
+        suite, control, reacher = import_dm_control(render)
         if domain == "reacher":
             need(REACHER.exists(), f"{REACHER}: no such file; run from a clone of the repository")
             self.env = control.Environment(
-                reacher.Physics.from_xml_path(str(REACHER)),
+                reacher.Physics.from_xml_string(REACHER.read_text("ascii")),
                 reacher.Reacher(REACHER_TARGET[name], random=0), time_limit=20)
         else:
             self.env = suite.load(domain, name, task_kwargs={"random": 0})
@@ -1641,8 +1675,24 @@ class Environment:
         control, reward = self._low + self._scale * (np.asarray(action, np.float64) + 1), 0.0
         for _ in range(self.action_repeat):
             timestep = self.env.step(control)
+            need(timestep.reward is not None, f"the episode is over ({self.episode_steps} "
+                 "decisions), or none has begun; call reset(seed)")
             reward += timestep.reward
         return self._observation(timestep), reward
+
+
+def robot_step(robot, action, sizes, t):
+    """Decision t of an episode: next observation (O,), reward, whether it is over. What goes to and
+    fro is copied. A robot's third value, if any, tells the end, or dm_control's reward of None: the
+    next episode has begun, and all of this is none of ours. UserError: what isn't finite."""
+    obs, reward, *over = robot.step(np.array(action))
+    need(len(over) < 2, f"decision {t}: expected (observation, reward), or a third, the end")
+    if reward is None and t:
+        return None, None, True
+    reward = np.asarray(reward, float)  # None is NaN
+    need(reward.size == 1 and np.isfinite(reward).all(), f"decision {t}: expected a finite reward, "
+         f"found {reward}")
+    return observed(obs, sizes, f"decision {t}: observation"), reward.item(), any(over)
 
 
 def task_names():
@@ -1698,19 +1748,17 @@ FORMAT = "fac-tdmpc-ref 1"
 @contextlib.contextmanager
 def atomic_file(path, mode="wb", **options):
     """A file that appears under its name only when it is complete; UserError if it can't."""
-    path, temporary = Path(path), None
+    path, temporary = Path(path), Path(f"{Path(path)}{os.urandom(4).hex()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(prefix=path.name, suffix=".tmp", dir=path.parent)
-        with os.fdopen(handle, mode, **options) as file:
+        with open(temporary, mode.replace("w", "x"), **options) as file:  # readable as umask says
             yield file
-        os.chmod(temporary, 0o644)
         os.replace(temporary, path)
     except OSError as error:
         raise UserError(f"{path}: can't be written: {error.strerror or error}") from error
     finally:
-        if temporary:
-            Path(temporary).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
 
 
 def check_writable(path):
@@ -1795,9 +1843,10 @@ def load_model(path, kinds=("expert", "student")):
             on_disk = on_disk[1:] if expected[0] == 1 else on_disk
             value = arrays.pop(key, None)
             need(value is not None, f"{path}: {key}: missing; expected float32 {on_disk}")
-            need((value.shape, value.dtype) == (on_disk, F32),
-                 f"{path}: {key}: expected float32 {on_disk}, found {value.dtype} {value.shape}; "
-                 f"the header's sizes and the weights disagree")
+            need(value.shape == on_disk, f"{path}: {key}: expected float32 {on_disk}, found "
+                 f"{value.dtype} {value.shape}; the header's sizes and the weights disagree")
+            need(value.dtype == F32, f"{path}: {key}: expected float32, found {value.dtype}; "
+                 "data/import_expert.py converts it")
             need(np.isfinite(value).all(), f"{path}: {key}: holds values that are not finite")
             params[key] = np.ascontiguousarray(value.reshape(expected))
     need(not arrays, f"{path}: {next(iter(arrays), None)}: unknown entry; expected TD-MPC's "
@@ -1823,45 +1872,55 @@ def made_for(header, where):
     return found
 
 
+def check_rows(name, rows, most=None):
+    """UserError names the first of rows (M, F) with a value that isn't finite, or above `most`."""
+    for i, j in np.argwhere(~(np.abs(rows) <= (most or np.finfo(rows.dtype).max)))[:1]:
+        wrong = "outside [-1, 1]" if np.isfinite(rows[i, j]) else "not finite"
+        raise UserError(f"{name}: row {i}, column {j}: {rows[i, j]} is {wrong}; mend or drop it")
+
+
 class Replay:
     """The dataset of Algorithm 1 [D6]: transitions in order, episode after episode.
 
-    observation (M, O) and action (M, A) float16, continues (M,): False in an episode's last
-    row, whose action stands for nothing. Raises UserError for anything else."""
+    observation (M, O) and action (M, A) float16 or float32, continues (M,): False in an episode's
+    last row, whose action stands for nothing. Raises UserError for anything else."""
 
     def __init__(self, path):
         self.path = path
         self.header, arrays = read_npz(path, ("replay",))
-        for key, rank, dtype in (("observation", 2, np.float16), ("action", 2, np.float16),
-                                 ("continues", 1, np.bool_)):
+        for key, rank, kinds in (("observation", 2, "float16, float32"), ("continues", 1, "bool"),
+                                 ("action", 2, "float16, float32")):
             value = arrays.get(key, np.zeros(0, object))
-            need((value.ndim, value.dtype) == (rank, dtype)
+            need(value.ndim == rank and str(value.dtype) in kinds.split(", ")
                  and len(value) == len(arrays["observation"]),
-                 f"{path}: {key}: expected {dtype.__name__} of rank {rank} with a row for each "
+                 f"{path}: {key}: expected {kinds} of rank {rank} with a row for each "
                  f"transition, found {f'{value.dtype} {value.shape}' if value.size else 'nothing'}")
-            need((np.abs(value) <= (1 if key == "action" else 65504)).all(), f"{path}: {key}: "
-                 "holds values that are not finite, or actions outside [-1, 1]")
+            if rank == 2:
+                check_rows(f"{path}: {key}", value, 1 if key == "action" else None)
         self.observation, self.action = arrays["observation"], arrays["action"]
         self.ends = np.flatnonzero(~arrays["continues"])
         self.dim_obs, self.dim_action = self.observation.shape[1], self.action.shape[1]
         self.transitions = len(self.observation) - len(self.ends)
         need(self.ends[-1:].tolist() == [len(self.observation) - 1],
-             f"{path}: continues: expected False in the last row")
+             f"{path}: continues: expected False in the last row, {len(self.observation) - 1}")
 
     def starts(self, length, held_out, seed=0):
         """Rows from which `length` actions stay in their episode: (training, held-out) rows.
 
-        Every (1 / held_out)-th episode is held out, early and late ones, which ones by the seed.
-        UserError: too few."""
-        every = max(2, round(1 / held_out))
-        training, held = [], []
-        for i, (begin, end) in enumerate(zip(np.r_[0, self.ends + 1], self.ends)):
-            into = held if (i + 1 - seed) % every == 0 else training
-            into.append(np.arange(begin, end - length + 1))
-        need(sum(map(len, training)) and sum(map(len, held)),
-             f"{self.path}: {len(self.ends)} episodes are too few to hold out a share of "
-             f"{held_out} and sample {length} actions in a row; collect more, or hold out more")
-        return np.concatenate(training), np.concatenate(held)
+        Every (1 / held_out)-th episode is held out, early and late ones, which ones by the seed; of
+        fewer one, of a single one its end. UserError: too short."""
+        begins, ends = np.r_[0, self.ends[:-1] + 1], self.ends
+        if len(ends) == 1:  # as two, of which the second is held out
+            cut = max(0, ends[0] - max(length, round(held_out * ends[0])))
+            begins, ends, seed = [0, cut], [cut, ends[0]], 0
+        parts = [np.arange(begin, end - length + 1) for begin, end in zip(begins, ends)]
+        rows, episode = np.concatenate(parts), np.repeat(np.arange(len(ends)), [*map(len, parts)])
+        for every in range(max(2, round(1 / held_out)), 1, -1):
+            held = (episode + 1 - seed) % every == 0
+            if 0 < held.sum() < len(rows):
+                return rows[~held], rows[held]
+        raise UserError(f"{self.path}: expected two episodes of at least {length} actions (horizon "
+                        f"+ 1), or one of {2 * length}; give longer ones, or lower the horizon")
 
     def sequences(self, starts, length):
         """First observations (O, B) and actions (L, A, B), float32, from the rows `starts` on."""
@@ -1896,23 +1955,28 @@ def data_file(task, name):
 
 def decisions(model, task, config, seeds, environment=None, noise=0.0):
     """Plan through the episode of each seed; yields every decision's observation (O,), action
-    (A,), reward and seconds of planning. environment: instead of the task's, equally long. noise:
-    each episode draws the deviation of what is added to its actions, evenly from 0 to this."""
+    (A,), reward and seconds of planning; past its end up to T NaN, reward 0. environment: instead
+    of the task's, see `robot_step`; with T as `episode_steps` if it has that. noise: each episode
+    draws the deviation of what is added to its actions, evenly from 0 to this."""
     environment = Environment(task, config.action_repeat) if environment is None else environment
-    planner = Planner(model, config)
+    planner, sizes = Planner(model, config), model.config
+    past = np.full(sizes.dim_obs, np.nan), np.full(sizes.dim_action, np.nan), 0.0, np.nan
     for seed in seeds:
         planner.reset(seed)
-        obs, rng = environment.reset(seed), stream(seed, "exploration")
-        deviation = F32(rng.uniform(0, noise))
-        for _ in range(config.episode_steps):
+        obs, rng = observed(environment.reset(seed), sizes), stream(seed, "exploration")
+        deviation, over = F32(rng.uniform(0, noise)), False
+        for t in range(getattr(environment, "episode_steps", config.episode_steps)):
+            if over:
+                yield past
+                continue
             begin = time.perf_counter()
             action = planner.act(obs)
             seconds = time.perf_counter() - begin
             if noise:
                 action = action + deviation * rng.standard_normal(action.shape, F32)
                 action = np.clip(action, -1, 1)
-            before, (obs, reward) = obs, environment.step(action)
-            yield before, action, reward, seconds
+            before, (obs, reward, over) = obs, robot_step(environment, action, sizes, t)
+            yield past if obs is None else (before, action, reward, seconds)
 
 
 def _playing_worker(connection):
@@ -1925,11 +1989,13 @@ def _playing_worker(connection):
 
 def play(model, task, config, seeds, workers=None, label="playing", environment=None, noise=0.0):
     """Plan through the episodes of `seeds`: observations (E, T, O), actions (E, T, A), rewards
-    (E, T) and seconds of planning (E, T), with T = config.episode_steps.
+    (E, T) and seconds of planning (E, T). T is the longest episode's; past a shorter one's end they
+    are NaN, its rewards 0.
 
     workers: processes that share the episodes [one for each core]; 0, or with an `environment`: all
     in this one. An episode depends on its seed, not on their number. noise: as `decisions`'s."""
-    E, T, sizes = len(seeds), config.episode_steps, model.config
+    T = getattr(environment, "episode_steps", config.episode_steps)
+    E, sizes = len(seeds), model.config
     at_once = math.gcd(T, 25)  # decisions of a worker's message: of one episode
     found = [np.zeros((E, T, *shape), F32) for shape in ((sizes.dim_obs,), (sizes.dim_action,))]
     found += [np.zeros((E, T)) for _ in range(2)]
@@ -1951,7 +2017,8 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
                     done[w] += len(played)
             bar.update(sum(done) - bar.n)
             bar.set_postfix_str(f"mean return about {found[2].sum() * T / sum(done):.0f}", False)
-    return found
+    longest = np.isfinite(found[0][..., 0]).sum(1).max(initial=0)
+    return [array[:, :longest] for array in found]
 
 
 def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="evaluating"):
@@ -1974,9 +2041,9 @@ def check_task(sizes, task, what="the model"):
 def progress(label, total, unit, initial=0):
     """A progress bar on stderr with rate and remaining time."""
     from tqdm import tqdm
-    return tqdm(desc=label, total=total, initial=initial, unit=unit, file=sys.stderr,
-                dynamic_ncols=True, smoothing=0.1, leave=None,  # one below another vanishes
-                mininterval=0.5 if sys.stderr.isatty() else 20)
+    return tqdm(desc=label, total=total, initial=initial, unit=unit, dynamic_ncols=True,
+                file=sys.stderr or open(os.devnull, "w"), mininterval=0.5 if os.isatty(2) else 20,
+                smoothing=0.1, leave=None)  # one below another vanishes
 
 
 def interleaved_seconds(calls, rounds, label):
@@ -2011,7 +2078,8 @@ def train_student(distiller, out, settings, planning, workers):
     """Algorithm 1 to its end, with a learning curve and checkpoints in the folder `out`.
 
     A run that was cut off goes on from its checkpoint to the same end (UserError: it is damaged, or
-    another run's). Returns (curve rows, seconds). workers: that play the expert's episodes [D8]."""
+    another run's). Returns (curve rows, seconds, those before it went on). workers: that play the
+    expert's episodes [D8]."""
     checkpoint, config, curve, before = out / "checkpoint.npz", distiller.config, [], 0.0
     if checkpoint.exists():
         header, arrays = read_npz(checkpoint, ("checkpoint",))
@@ -2046,7 +2114,7 @@ def train_student(distiller, out, settings, planning, workers):
                 write_npz(checkpoint, {"kind": "checkpoint", "settings": settings, "curve": curve,
                                        "seconds": seconds}, distiller.state())
                 saved = time.time()
-    return curve, before + time.time() - began
+    return curve, before + time.time() - began, before
 
 
 def same_settings(found, expected, where, group=""):
@@ -2085,6 +2153,7 @@ def optional(library, extra):
 
 def pyplot():
     """matplotlib.pyplot, in this project's style, without a display; UserError if missing."""
+    os.environ.pop("MPLBACKEND", None)  # a notebook's, which may not be here
     with optional("matplotlib", "plots"):
         import matplotlib
     matplotlib.use("Agg")
@@ -2092,7 +2161,8 @@ def pyplot():
     cycle = matplotlib.cycler(  # told apart in black and white, too
         color=["#0072b2", "#d55e00", "#009e73", "#333333", "#cc79a7", "#e69f00", "#56b4e9"],
         linestyle=["-", "--", "-.", ":", "-", "--", "-."])
-    plt.rcParams.update({"axes.grid": True, "grid.alpha": 0.3, "axes.prop_cycle": cycle})
+    plt.rcParams.update({"axes.grid": True, "grid.alpha": 0.3, "axes.prop_cycle": cycle,
+                         "text.usetex": False})
     return plt
 
 
@@ -2103,12 +2173,19 @@ def save_figure(path, figure):
     pyplot().close(figure)
 
 
-def draw_curve(path, curve, title):
-    """Losses and rank correlations over the steps; False where matplotlib is missing."""
+def drawn(draw, path, *what):
+    """Whether draw(path, ...) made its picture; what goes wrong is said, and costs nothing else."""
     try:
-        plt = pyplot()
-    except UserError:
+        draw(path, *what)
+        return True
+    except Exception as error:
+        print(f"{path}: no picture: {' '.join(str(error).split())[:300]}", file=sys.stderr)
         return False
+
+
+def draw_curve(path, curve, title):
+    """Losses and rank correlations over the steps."""
+    plt = pyplot()
     columns = dict(zip(CURVE, np.array(curve).T))
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
     for ax, lines in zip(axes, ({"kl_reward": "rewards", "kl_value": "values"}, {
@@ -2121,7 +2198,6 @@ def draw_curve(path, curve, title):
     axes[0].set(yscale="log", ylabel="KL divergence", title=title)
     axes[1].set(ylim=(None, 1), ylabel="rank correlation", title="held-out states")
     save_figure(path, figure)
-    return True
 
 
 def read_records(path):
@@ -2193,7 +2269,7 @@ def command_distill(args):
         both = (expert, own), (distiller.student, planning)
         result.update(evaluate_both(*both, record, args))
         result.update(time_both(*both, obs))
-        result["seconds_total"] = round(time.time() - began, 1)
+        result["seconds_total"] = round(result["seconds_total"] + time.time() - began, 1)
         write_json(out / "result.json", result)
     report(result, (own, planning), args.eval_seed)
     return result
@@ -2234,7 +2310,7 @@ def distil_and_save(distiller, args, planning, header, out):
     print(f"{args.task}: {student.config.num_agents} agents, {len(distiller.optimizer.vector):,} "
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
-    curve, seconds = train_student(distiller, out, settings, planning, args.workers)
+    curve, seconds, before = train_student(distiller, out, settings, planning, args.workers)
     width, gains = planning.max_std, None
     if planning.prior == "policy" and getattr(args, "PlannerConfig.max_std") is None:
         width, gains = search_width(distiller, planning)
@@ -2244,11 +2320,11 @@ def distil_and_save(distiller, args, planning, header, out):
         "planner": {name: getattr(planning, name) for name in STUDENT_PLANNING}})
     write_json(out / "config.json", {**settings, "planner": asdict(planning)})
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
-            "steps": config.steps, "seconds": round(seconds, 1), "kl_reward": curve[-1][3],
-            "kl_value": curve[-1][4], **rank_results(distiller, 256, planning.discount),
-            "search_width": width, "plan_gains": gains, "out": str(out),
-            "picture": draw_curve(out / "curve.png", curve,
-                                  f"{args.task}, seed {args.seed}")}, planning
+            "steps": config.steps, "seconds": round(seconds, 1), "seconds_total": before,
+            "kl_reward": curve[-1][3], "kl_value": curve[-1][4], "search_width": width,
+            "plan_gains": gains, **rank_results(distiller, 256, planning.discount), "out": str(out),
+            "picture": drawn(draw_curve, out / "curve.png", curve,
+                             f"{args.task}, seed {args.seed}")}, planning
 
 
 def evaluate_both(expert, student, record, args):
@@ -2325,7 +2401,6 @@ def report(result, plannings, eval_seed):
         if width == result["search_width"]:
             print(f"plans around the policy, deviation {width}: {gain:.2f} ± {se:.2f} above it by "
                   f"the expert's G in held-out states, {promise:.2f} by the student's")
-    print("" if result["picture"] else "pip install 'fac-tdmpc-ref[plots]' draws curve.png, too")
 
 
 def return_kept(student, expert):
@@ -2462,6 +2537,8 @@ def make_parser():
 
 def run_command(parser, argv=None):
     """Run a command line; returns the exit status: 2, with one line, for what the user can mend."""
+    sys.stdin, sys.stdout, sys.stderr = (stream or open(os.devnull, "r+") for stream in (
+        sys.stdin, sys.stdout, sys.stderr))  # a closed one's number is not for the next file
     args = parser.parse_args(argv)
     warnings.simplefilter("ignore", RuntimeWarning)  # what isn't finite is refused in one line
     if hasattr(sys.stdout, "reconfigure"):  # a terminal that has no ±

@@ -18,10 +18,12 @@ import argparse
 import dataclasses
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 
-import fac_tdmpc_ref as fac
+sys.path.insert(0, str(Path(__file__).resolve().parent))  # PYTHONSAFEPATH leaves it out
+import fac_tdmpc_ref as fac  # noqa: E402
 
 # the task of the authors' notebook
 LINKS = np.array([10.0, 20.0, 5.0])
@@ -389,7 +391,7 @@ def command_demo(args):
     print_comparison(args, runs, result)
     print_appendix(result)
     if args.figure:
-        draw_figure(args.figure, runs, goal_map(np.random.default_rng([args.seed, 2])))
+        fac.drawn(draw_figure, args.figure, runs, goal_map(np.random.default_rng([args.seed, 2])))
     settings = {k: v for k, v in vars(args).items() if k != "run"}
     return {**result, "settings": settings, "cores": fac.cores()}
 

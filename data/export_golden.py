@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
 import fac_tdmpc_ref as fac  # noqa: E402
 from numpy_learner import ExpertConfig  # noqa: E402
 

@@ -5,10 +5,12 @@
 
 It reads official TD-MPC `.pt` files ({"model": ..., "model_target": ...} or a bare state dict) and
 the same names in a `.safetensors` or an `.npz`; float64, float32, float16 and bfloat16 (not .npz).
-DIR gets expert.npz and, with --replay (arrays that you have) or --collect (episodes that the expert
-plays now), replay.npz. The expert must read dm_control's observation dict in its own order. All
-that plays it follows the --action-repeat that the files then name: 2 in TD-MPC's code, 4 for
-reacher, hopper, fish, cheetah and quadruped.
+What wrappers put before the names (`_orig_mod.`, `module.`, `agent.model.`) is taken off, and what
+lies beside the weights (steps, settings, optimizers) left alone. DIR gets expert.npz and, with
+--replay (arrays that you have, by this project's names or D4RL's, in an .npz or HDF5) or --collect
+(episodes that the expert plays now), replay.npz. The expert must read dm_control's observation dict
+in its own order. All that plays it follows the --action-repeat that the files then name: 2 in
+TD-MPC's code, 4 for reacher, hopper, fish, cheetah and quadruped.
 
 A file is data, whoever made it. A `.pt` is a zip around a pickle, and a pickle is a program:
 `read_pickle` knows the opcodes and names that a state dict is made of and refuses all others, so
@@ -29,7 +31,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
 import fac_tdmpc_ref as fac  # noqa: E402
 from fac_tdmpc_ref import need  # noqa: E402
 from train_expert import Episode, ReplayBuffer  # noqa: E402
@@ -40,6 +42,8 @@ MAX_PIECE = 1 << 20  # that is read of a zip at once
 MAX_MEMBERS = 4096  # of a zip
 MAX_HEADER = 1 << 17  # bytes of data.pkl, or of a safetensors header; a checkpoint's has 10,000
 MAX_WEIGHTS = 1 << 25
+MAX_ENTRIES = 1 << 14  # of a checkpoint's dicts, all together
+MAX_NAME = 200  # characters; longer ones are no weight's
 MAX_RANK = 8
 MAX_NOISE = 0.5  # largest deviation of the noise on collected actions
 LEAST_EPISODES = 10  # distill holds out one in 10
@@ -95,25 +99,31 @@ def unpack(archive, member):
     return data
 
 
-NPY = re.compile(rb"\x93NUMPY\x01\x00(..)\{'descr': '([<>|](?:f[248]|b1))', 'fortran_order': "
+NPY = re.compile(rb"\x93NUMPY\x01\x00(..)\{'descr': '([<>|](?:f[248]|[bui]1))', 'fortran_order': "
                  rb"(True|False), 'shape': \((\d{1,9}(?:, \d{1,9})*),?\), \} *\n", re.DOTALL)
 
 
+Unread = namedtuple("Unread", "reason")  # an entry that matters only if it is asked for
+
+
 def read_npz(path):
-    """{name: array} of an .npz. Headers are matched, not evaluated."""
+    """{name: array, or Unread} of an .npz. Headers are matched, not evaluated."""
     found = {}
     for name, data in read_zip(path).items():
         name, match = name.removesuffix(".npy"), NPY.match(data)
         if name == "header":  # in this project's own files
             continue
-        need(match and match.end() == 10 + int.from_bytes(match[1], "little"),
-             f"{short(name)}: expected an array of floats or bools, as numpy.savez writes it")
+        if not match or match.end() != 10 + int.from_bytes(match[1], "little"):
+            found[name] = Unread("no array of floats or bools as numpy.savez writes it")
+            continue
         shape, dtype = [int(n) for n in match[4].split(b", ")], np.dtype(match[2].decode())
-        need(0 < math.prod(shape) * dtype.itemsize == len(data) - match.end() and
-             len(shape) <= MAX_RANK, f"{short(name)}: declares {dtype} {shape[:MAX_RANK]}, holds "
-             f"{len(data) - match.end()} bytes")
-        found[name] = np.ndarray(shape, dtype, data, match.end(),
-                                 order="F" if match[3] == b"True" else "C")
+        if (0 < math.prod(shape) * dtype.itemsize == len(data) - match.end() and
+                len(shape) <= MAX_RANK):
+            found[name] = np.ndarray(shape, dtype, data, match.end(),
+                                     order="F" if match[3] == b"True" else "C")
+        else:
+            found[name] = Unread(f"{dtype} {shape[:MAX_RANK]}, as it declares, in "
+                                 f"{len(data) - match.end()} bytes")
     return found
 
 
@@ -125,9 +135,9 @@ Storage = namedtuple("Storage", "data dtype")  # a tensor's memory: a member's b
 # NumPy has no bfloat16: unsigned integers, which are read for nothing else, stand for it
 STORAGES = {"torch DoubleStorage": "f8", "torch FloatStorage": "f4", "torch HalfStorage": "f2",
             "torch BFloat16Storage": "u2", "torch LongStorage": "i8"}
-OPCODES = set("""PROTO NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 BINUNICODE EMPTY_DICT MARK
-EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 BINPUT LONG_BINPUT BINGET LONG_BINGET SETITEM SETITEMS BUILD
-GLOBAL REDUCE BINPERSID""".split())
+OPCODES = set("""PROTO NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 BINFLOAT BINUNICODE EMPTY_DICT
+MARK EMPTY_LIST APPEND APPENDS EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 BINPUT LONG_BINPUT BINGET
+LONG_BINGET SETITEM SETITEMS BUILD GLOBAL REDUCE BINPERSID""".split())
 CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
 
 
@@ -153,9 +163,9 @@ def read_pt(path):
 def read_pickle(data, members, byteorder):
     """The dict that a state dict's pickle describes, built opcode by opcode; nothing is called.
 
-    Values are None, bool, int, str, tuple, dict, Global, Storage, and arrays that are views of a
-    member's bytes. An opcode makes one at most, so `data` bounds them all; types are compared
-    before anything is done to a value, only str is hashed, and nothing recurs.
+    Values are None, bool, int, float, str, tuple, list, dict, Global, Storage, and arrays that are
+    views of a member's bytes. An opcode makes one at most, so `data` bounds them all; types are
+    compared before anything is done to a value, only str and int are hashed, and nothing recurs.
     """
     need(len(data) <= MAX_HEADER, f"has {len(data)} bytes, more than {MAX_HEADER}")
     stack, below, memo = [], [], {}  # below: the stacks beneath each MARK
@@ -165,10 +175,17 @@ def read_pickle(data, members, byteorder):
                 need(argument == 2, "has another protocol than 2")
             case "NONE" | "NEWTRUE" | "NEWFALSE" | "EMPTY_TUPLE":
                 stack.append(CONSTANTS[name])
-            case "BININT" | "BININT1" | "BININT2" | "BINUNICODE":
+            case "BININT" | "BININT1" | "BININT2" | "BINFLOAT" | "BINUNICODE":
                 stack.append(argument)
             case "EMPTY_DICT":
                 stack.append({})
+            case "EMPTY_LIST":
+                stack.append([])
+            case "APPEND":
+                add_items(stack[-2], [stack.pop()])
+            case "APPENDS":
+                items, stack = stack, below.pop()
+                add_items(stack[-1], items)
             case "MARK":
                 below.append(stack)
                 stack = []
@@ -218,10 +235,16 @@ def opcodes(stream):
 
 
 def set_items(target, items):
-    """A dict's next names and values."""
-    need(type(target) is dict and not len(items) % 2 and all(type(k) is str for k in items[::2]),
-         "sets other items than a dict's, by names")
+    """A dict's next names, or numbers as an optimizer's, and values."""
+    need(type(target) is dict and not len(items) % 2 and
+         all(type(k) in (str, int) for k in items[::2]), "sets other items than a dict's, by names")
     target.update(zip(items[::2], items[1::2]))
+
+
+def add_items(target, items):
+    """A list's next values."""
+    need(type(target) is list, "adds to something else than a list")
+    target.extend(items)
 
 
 def reduce(function, arguments):
@@ -281,46 +304,105 @@ def read_safetensors(path):
     return {name: np.ndarray(t["shape"], kinds[t["dtype"]], t["data"]) for name, t in found}
 
 
+# ------------------------------------------------------------------------------------ HDF5
+
+OWN = {"observation": "observations", "action": "actions", "continues": None}  # and D4RL's name
+D4RL_ENDS = "terminals", "timeouts"
+
+
+def read_hdf5(path):
+    """{name: array} of what a replay needs of the root of an HDF5 file, by way of h5py. Of the
+    file's own bytes alone: it may name others."""
+    with fac.optional("h5py for HDF5", "hdf5"):
+        import h5py
+    found, limit = {}, min(MAX_BYTES, MAX_PIECE + MAX_RATIO * path.stat().st_size)
+    try:
+        with h5py.File(path, "r") as file:
+            for name in filter(file.__contains__, (*OWN, *filter(None, OWN.values()), *D4RL_ENDS)):
+                own = type(file.get(name, getlink=True)) is h5py.HardLink
+                data = file[name] if own else None
+                need(type(data) is h5py.Dataset and not (data.external or data.is_virtual) and
+                     data.dtype.kind in "fbiu" and data.nbytes <= limit, f"{name}: expected an "
+                     f"array in this file, of numbers, of at most {limit} bytes")
+                found[name], limit = data[()], limit - data.nbytes
+    except fac.UserError:
+        raise
+    except Exception as error:  # the library's own, mostly
+        raise fac.UserError(f"not a readable HDF5 file ({short(error)})") from None
+    return found
+
+
 # ------------------------------------------------------------------------------ the expert
 
-READERS = {".pt": read_pt, ".pth": read_pt, ".npz": read_npz, ".safetensors": read_safetensors}
+CHECKPOINTS = {".pt": read_pt, ".pth": read_pt, ".npz": read_npz, ".safetensors": read_safetensors}
+REPLAYS = {".npz": read_npz, ".hdf5": read_hdf5, ".h5": read_hdf5}
 
 
 @contextlib.contextmanager
-def reading(path, kinds=tuple(READERS)):
+def reading(path, kinds=CHECKPOINTS):
     """What a file holds, found by the end of its name; every UserError inside begins with it."""
     try:
         need(Path(path).is_file() and Path(path).suffix in kinds,
              f"no such file, or its name doesn't end in {', '.join(kinds)}")
-        yield READERS[Path(path).suffix](Path(path))
+        yield kinds[Path(path).suffix](Path(path))
     except fac.UserError as error:
         raise fac.UserError(f"{path}: {error}") from None
     except OSError as error:
         raise fac.UserError(f"{path}: can't be read: {error.strerror or error}") from None
 
 
+FIRST = "_encoder.0.weight"
+WRAPPERS = re.compile(r"(?:(?<=\.)|^)(?:_orig_mod|module)\.")  # torch.compile, data parallel
+
+
 def state_dict(found):
-    """The weights in what a file holds: {name: array} of `model` if it has that, or of all."""
-    flat = {}
-    for key, value in found.items():
-        flat.update({f"{key}.{k}": v for k, v in value.items()} if type(value) is dict
-                    else {key: value})
-    if any(key.startswith("model.") for key in flat):
-        flat = {k.removeprefix("model."): v for k, v in flat.items()
-                if not k.startswith("model_target.")}
-    return flat
+    """The weights in what a file holds, {name: value}: of all dicts in it, those beside FIRST. What
+    stands before that is taken off all; TD-MPC's `model_target` and others don't count."""
+    flat, waiting, entries = {}, [("", found)], 0
+    while waiting:
+        prefix, values = waiting.pop()
+        entries += len(values)
+        need(entries <= MAX_ENTRIES, f"expected at most {MAX_ENTRIES} entries")
+        for key, value in values.items():
+            key = f"{prefix}{str(key)[:MAX_NAME]}"
+            if type(value) is dict and len(key) < MAX_NAME:
+                waiting.append((f"{key}.", value))
+            elif len(key) < MAX_NAME:
+                need(flat.setdefault(name := WRAPPERS.sub("", key), value) is value,
+                     f"{short(name)}: two entries of this name")
+    before = [key.removesuffix(FIRST) for key in flat if ("." + key).endswith("." + FIRST)]
+    models = [prefix for prefix in before if "target" not in prefix]
+    need(len(models) < 2 or "model." in models or "" in models, f"several models: "
+         f"{', '.join(map(short, models[:4]))}; save one of them alone")
+    prefix = next((p for p in ("model.", "", *models) if p in models), "")
+    beside = (*(p for p in before if len(p) > len(prefix)), *(
+        f"{key}." for key, value in found.items() if type(value) is dict and not prefix))
+    return {key.removeprefix(prefix): value for key, value in flat.items()
+            if key.startswith(prefix) and not key.startswith(beside)}
+
+
+def is_weight(value):
+    """Whether it is an array of floats; u2 stands for bfloat16."""
+    return type(value) is np.ndarray and value.dtype.str[1:] in ("f2", "f4", "f8", "u2")
+
+
+def described(value):
+    """What a message says of what a file holds under a name."""
+    return (f"{value.dtype} {value.shape}" if type(value) is np.ndarray else
+            value.reason if type(value) is Unread else
+            "nothing" if value is None else type(value).__name__)
 
 
 def find_sizes(state):
     """The ModelConfig that three of the weights' shapes tell."""
     shapes = []
-    for key, meaning in (("_encoder.0.weight", "(hidden, dim O)"),
-                         ("_encoder.2.weight", "(latent, hidden)"),
+    for key, meaning in ((FIRST, "(hidden, dim O)"), ("_encoder.2.weight", "(latent, hidden)"),
                          ("_dynamics.0.weight", "(hidden, latent + dim A)")):
-        shape = getattr(state.get(key), "shape", "nothing")
+        shape = getattr(state.get(key), "shape", ())
         least = shapes[1][0] if len(shapes) == 2 else 0
-        need(len(shape) == 2 and shape[1] > least,
-             f"{key}: expected a matrix {meaning}, found {shape}; {ELSEWHERE}")
+        need(len(shape) == 2 and shape[1] > least, f"{key}: expected a matrix {meaning}, found "
+             f"{described(state.get(key))} among {', '.join(map(short, [*state][:5])) or 'nothing'}"
+             f"; {ELSEWHERE}")
         shapes.append(shape)
     (enc, dim_obs), (latent, _), (hidden, joint) = shapes
     return fac.ModelConfig(dim_obs, joint - latent, 1, latent, enc, hidden)
@@ -335,8 +417,9 @@ def find_expert(path, task):
         for name, i, kind, shape, _ in fac.layers(sizes, any(k.startswith("_pi.") for k in state)):
             expected[f"{name}.{i}.weight"] = shape[1:] if kind == "linear" else shape[1:2]
             expected[f"{name}.{i}.bias"] = shape[1:2]
-        for key in state:
-            need(key in expected, f"{short(key)}: unknown entry; {ELSEWHERE}")
+        for key, value in state.items():  # steps and settings may be there
+            need(key in expected or not is_weight(value),
+                 f"{short(key)}: unknown entry; {ELSEWHERE}")
         need(sum(map(math.prod, expected.values())) <= MAX_WEIGHTS,
              f"expected at most {MAX_WEIGHTS} weights, found more")
         weights = {key: as_float32(key, state.get(key), shape) for key, shape in expected.items()}
@@ -346,10 +429,8 @@ def find_expert(path, task):
 
 def as_float32(key, value, shape):
     """A weight as the module keeps it; UserError if it is of another shape or kind."""
-    found = (f"{value.dtype} {value.shape}" if type(value) is np.ndarray else
-             "nothing" if value is None else type(value).__name__)
-    need(type(value) is np.ndarray and value.dtype.kind in "fu" and value.shape == shape,
-         f"{key}: expected floats {shape}, found {found}; {ELSEWHERE}")
+    need(is_weight(value) and value.shape == shape,
+         f"{key}: expected floats {shape}, found {described(value)}; {ELSEWHERE}")
     with np.errstate(over="ignore"):
         value = np.ascontiguousarray(widened(value), np.float32)
     need(np.isfinite(value).all(), f"{key}: holds values that are not finite in float32; choose "
@@ -365,25 +446,41 @@ def widened(value):
 # ------------------------------------------------------------------------------ the replay
 
 def find_replay(path, sizes):
-    """What replay.npz needs, from an .npz that holds it in any precision."""
-    with reading(path, (".npz",)) as found:
-        for key in ("observation", "action", "continues"):
-            need(key in found, f"{key}: not there, only {', '.join(map(short, found))}")
-        rows = found["continues"].size
+    """What replay.npz needs, from an .npz or HDF5 file that holds it in any precision, by this
+    project's names or D4RL's."""
+    with reading(path, REPLAYS) as found:
+        if OWN["observation"] in found and "observation" not in found:
+            found = from_d4rl(found)
+        for key in OWN:
+            need(key in found, f"{key}: not there, only {', '.join(map(short, [*found][:9]))}")
+        rows = getattr(found["continues"], "size", 0)
         for key, kind, shape in (("continues", "bool", (rows,)),
                                  ("observation", "float", (rows, sizes.dim_obs)),
                                  ("action", "float", (rows, sizes.dim_action))):
-            have = f"{found[key].dtype} {found[key].shape}"
+            have = described(found[key])
             need(have.startswith(kind) and found[key].shape == shape,
                  f"{key}: expected {kind} {shape}, found {have}")
         continues = found["continues"]
-        with np.errstate(over="ignore"):
-            observation = found["observation"].astype(np.float16)
-            action = np.where(continues[:, None], found["action"], 0).astype(np.float16)
-        need(not continues[-1] and np.isfinite(observation).all() and (abs(action) <= 1).all(),
-             "expected continues False in the last row, observations that float16 can hold, and "
-             "actions in [-1, 1]")
-    return {"observation": observation, "action": action, "continues": continues}
+        need(not continues[-1], f"continues: row {rows - 1}, the last: expected False, as in every "
+             "episode's last row; cut an unfinished one off, or end it there")
+        action = np.where(continues[:, None], found["action"], 0)
+        fac.check_rows("action", action, 1.0005)  # as float16 rounds
+        observation = fac.compact(found["observation"])
+        fac.check_rows("observation", observation)
+    return {"observation": observation, "action": fac.compact(np.clip(action, -1, 1)),
+            "continues": continues}
+
+
+def from_d4rl(found):
+    """D4RL's arrays by this project's names: an episode's last row is one of `terminals` or
+    `timeouts`, or the file's, whose action goes unused, for what follows it isn't there."""
+    ends = [np.ravel(found[key]) != 0 for key in D4RL_ENDS if type(found.get(key)) is np.ndarray]
+    need(ends and len({len(end) for end in ends}) == 1, f"expected {' or '.join(D4RL_ENDS)}, "
+         f"equally long, found {', '.join(map(short, [*found][:9]))}")
+    continues = ~np.logical_or.reduce(ends)
+    continues[-1] = False
+    return {"continues": continues, **{own: found[theirs] for own, theirs in OWN.items()
+                                       if theirs in found}}
 
 
 def collect(path, environment, episodes, seed):
@@ -470,22 +567,20 @@ def report(result):
     if not episodes:
         lines += [f"distill needs --replay FILE beside --expert {result['out']}/expert.npz, or run "
                   f"this again with --collect {LEAST_EPISODES}"]
-    elif episodes < LEAST_EPISODES:
-        lines += [f"distill holds out one episode in {LEAST_EPISODES}, of {episodes} none: give it "
-                  f"--held-out {min(0.5, 1 / episodes):.3f}, or more episodes"]
     return "\n".join(lines)
 
 
 def main(argv=None):
     """Run the command line; returns the exit status."""
     parser = fac.Parser(prog="import_expert.py", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("file", metavar="FILE", help="checkpoint: " + ", ".join(READERS))
+    parser.add_argument("file", metavar="FILE", help="checkpoint: " + ", ".join(CHECKPOINTS))
     parser.add_argument("--task", required=True, help="one of: " + fac.task_names())
     parser.add_argument("--out", required=True, help="folder for expert.npz and replay.npz")
     parser.add_argument("--action-repeat", type=fac.natural, default=fac.ACTION_REPEAT, metavar="N",
                         help="control steps of the expert's decisions [%(default)s]")
     data = parser.add_mutually_exclusive_group()
-    data.add_argument("--replay", help="an .npz with observation, action and continues (README)")
+    data.add_argument("--replay", help="an .npz or HDF5 with observation, action and continues "
+                      "(README), or observations, actions, terminals, timeouts (D4RL)")
     data.add_argument("--collect", type=fac.natural, metavar="N", help="have it play N episodes")
     parser.add_argument("--seed", type=fac.natural, default=0, help="of these episodes [0]")
     parser.add_argument("--json", action="store_true", help="print JSON as stdout's last line")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
 import fac_tdmpc_ref as fac  # noqa: E402
 
 PIXELS, BARS, TEXT = 240, 70, 34  # a picture's side, width of the bars beside, height of the text
@@ -41,7 +41,7 @@ def watch_episode(path, model, header, task, seed, decisions, every):
     """Frames of a model's episode: picture, shares (N,) and return so far of each; its name, the
     median milliseconds of a decision, and the return in the end."""
     config = fac.PlannerConfig(**fac.made_for(header, path))
-    environment = fac.Environment(task, config.action_repeat)
+    environment = fac.Environment(task, config.action_repeat, render=True)
     frames, total, seconds = [], 0.0, []
     with fac.Planner(model, config) as planner, fac.progress(f"playing {path}", decisions,
                                                              "decision") as bar:
@@ -184,10 +184,10 @@ def frames_at(task, seed, actions, moments, action_repeat):
     """Pictures of an episode, played again, before these decisions; {} where nothing draws."""
     try:
         choose_renderer()
+        environment, found = fac.Environment(task, action_repeat, render=True), {}
     except fac.UserError as error:
         print(error, file=sys.stderr)
         return {}
-    environment, found = fac.Environment(task, action_repeat), {}
     environment.reset(seed)
     for t in range(max(moments) + 1):
         if t in moments:
@@ -240,7 +240,7 @@ def command_figure9(args):
             if t in pictures:
                 ax.imshow(pictures[t])
                 ax.set_title(f"decision {t}")
-    fac.save_figure(args.out, figure)
+    fac.drawn(fac.save_figure, args.out, figure)
     result = {"out": args.out, "task": task, "episodes": args.episodes, "silhouette": apart,
               "silhouette_shuffled": shuffled, "return_best": float(returns.max()),
               "return_worst": float(returns.min()), "moments": moments,
@@ -300,7 +300,7 @@ def command_agreement(args):
     ax.set(xlabel="decision", ylabel="rank correlation with the expert's Q", ylim=(None, 1),
            title=f"{task}, the worst of {args.episodes} episodes: {rewards[worst].sum():.0f}")
     ax.legend(ncols=1 + len(own) // 8)
-    fac.save_figure(args.out, figure)
+    fac.drawn(fac.save_figure, args.out, figure)
     result = {"out": args.out, "task": task, "held_out": known.mean(1).tolist(),
               "worst_episode": own.mean(1).tolist(), "when": when.tolist(),
               "return_worst": float(rewards[worst].sum()), "plan_gain": gain,

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
 import fac_tdmpc_ref as fac  # noqa: E402
 from look import pyplot_for  # noqa: E402
 
@@ -203,7 +203,7 @@ def command_table3(args):
               "cores": fac.cores()}
     print_benchmark(result, args.robots)
     if args.figure:
-        draw_prediction(args.figure, prediction, args.robots)
+        fac.drawn(draw_prediction, args.figure, prediction, args.robots)
     return result
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
 import fac_tdmpc_ref as fac  # noqa: E402
 
 
@@ -50,7 +50,7 @@ def cell(found):
     return f"{found['mean']:.0f}{spread}{rank}{ms}"
 
 
-def draw_lines(path, panels, xlabel, **axes):
+def draw_lines(path, panels, xlabel, xscale=None):
     """A panel each {title: ({label: {x: [values]}}, level or None)}: mean and band (± sample
     deviation) over seeds; the level, an expert's, is a line across."""
     plt = fac.pyplot()
@@ -74,8 +74,8 @@ def draw_lines(path, panels, xlabel, **axes):
         if level is not None:
             ax.axhline(level, color="black", linewidth=0.8, linestyle=(0, (1, 3)), label="expert")
         ax.set(title=title, xlabel=xlabel, ylabel="episode return",
-               ylim=(0, 1.05 * ax.get_ylim()[1]), **axes)
-        if axes:  # logarithmic: a tick for each point
+               ylim=(0, 1.05 * ax.get_ylim()[1]), xscale=xscale or "linear")
+        if xscale:  # logarithmic: a tick for each point
             ax.set_xticks(x := sorted(set().union(*lines.values())), [f"{v:.0f}" for v in x])
             ax.minorticks_off()
         else:

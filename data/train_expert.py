@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
 import fac_tdmpc_ref as fac  # noqa: E402
 from numpy_learner import ExpertConfig, Learner, load_named, named  # noqa: E402
 
@@ -51,7 +51,8 @@ class Episode:
     def __init__(self, environment, seed, player=None, exploration_std=0.0):
         self.environment, self.seed, self.player = environment, seed, player
         self.exploration_std, self.rng = exploration_std, fac.stream(seed, "exploration")
-        self.observation, self.action, self.reward = [environment.reset(seed)], [], []
+        self.observation = [fac.observed(environment.reset(seed), environment)]
+        self.action, self.reward = [], []
         self._warm_start = None
 
     def play(self, planner, decisions):
@@ -62,7 +63,10 @@ class Episode:
             planner.reset(self.seed)
         for _ in range(decisions):
             self.action.append(self._explore(planner))
-            obs, reward = self.environment.step(self.action[-1])
+            obs, reward, over = fac.robot_step(self.environment, self.action[-1], self.environment,
+                                               len(self.reward))
+            fac.need(not over, f"decision {len(self.reward)}: the episode is over; to learn from, "
+                     "all must be equally long")
             self.observation.append(obs)
             self.reward.append(reward)
         own = planner and planner.own
@@ -187,15 +191,15 @@ class ReplayBuffer:
         held = np.arange(self.count - len(self), self.count) % len(self.reward)
         count = min(episodes or len(held), len(held))
         order = held[::-1][np.arange(count) * len(held) // count][::-1]
-        action = np.zeros((len(order), self.steps + 1, self.action.shape[2]), np.float16)
+        action = np.zeros((len(order), self.steps + 1, self.action.shape[2]), np.float32)
         action[:, :-1] = self.action[order]
         continues = np.ones(action.shape[:2], bool)
         continues[:, -1] = False
         observation = self.observation[order].reshape(-1, self.observation.shape[2])
         spread_targets(header["task"], observation, fac.stream(0, "replay targets"))
         fac.write_npz(path, {"kind": "replay", **header}, {
-            "observation": observation.astype(np.float16),
-            "action": action.reshape(-1, action.shape[2]), "continues": continues.ravel()},
+            "observation": fac.compact(observation), "continues": continues.ravel(),
+            "action": fac.compact(action.reshape(-1, action.shape[2]))},
             compress=True)
 
 
@@ -613,21 +617,17 @@ def export(training, out, result):
         result["lag"] = {str(p): lag(training.curve, p / 100) for p in (50, 75, 90)}
         if args.episodes:
             result["ratio"] = fac.return_kept(result["student_return_mean"], result["return_mean"])
-    drawn = draw(out / "curve.png", training.curve, f"{args.task}, seed {args.seed}")
+    fac.drawn(draw, out / "curve.png", training.curve, f"{args.task}, seed {args.seed}")
     print(f"\n{args.task}: {training.decisions:,} decisions, {result['updates']:,} updates, "
           f"{training.seconds / 60:.1f} minutes; {args.episodes} evaluation episodes\n")
     fac.print_table(rows)
-    print(f"\n{out}/" + ("" if drawn else
-                         "\n(no picture: pip install 'fac-tdmpc-ref[plots]' draws curve.png)"))
+    print(f"\n{out}/")
     return result
 
 
 def draw(path, curve, title):
-    """Returns over the decisions; False where matplotlib is missing."""
-    try:
-        plt = fac.pyplot()
-    except fac.UserError:
-        return False
+    """Returns over the decisions."""
+    plt = fac.pyplot()
     figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
     for key, label, style in (("return_mean", "training episodes", {"alpha": 0.5}),
                               ("eval_expert", "expert", {"marker": "o"}),
@@ -638,7 +638,6 @@ def draw(path, curve, title):
     axes.set(xlabel="decisions (two environment steps each)", ylabel="return", title=title)
     axes.legend()
     fac.save_figure(path, figure)
-    return True
 
 
 def make_parser():

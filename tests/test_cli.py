@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -283,7 +284,7 @@ def refused(done, *parts, program="fac_tdmpc_ref.py"):
     (["--expert-episodes", "1", "--played-share", "0"], ["played_share", "above 0", "not 0.0"]),
     (["--encoder-input", "observation"], ["no policy", "--plan-prior none"]),
     (["--held-out", "1"], ["held_out", "at least 0.0001 and at most 0.5"]),
-    (["--held-out", "0.05"], ["replay.npz", "6 episodes are too few"]),
+    (["--horizon", "40"], ["replay.npz", "two episodes of at least 41 actions"]),
     (["--kl", "sideways"], ["--kl", "'sideways'", "forward"]),
     (["--plan-horizon", "0"], ["--plan-horizon"]),
     (["--plan-min-std", "3"], ["min_std", "max_std"]),
@@ -445,6 +446,116 @@ def test_distill_shows_its_progress(distilled):
     assert "Traceback" not in done.stderr and "Warning" not in done.stderr
 
 
+@pytest.mark.skipif(not importlib.util.find_spec("matplotlib"), reason="no matplotlib")
+@pytest.mark.parametrize("broken", [False, True])
+def test_a_picture_costs_no_result(tmp_path, files, broken):
+    """A notebook's backend and a user's LaTeX are theirs; what else goes wrong is said."""
+    (tmp_path / "matplotlibrc").write_text("text.usetex: True\n")
+    (tmp_path / "at" / "matplotlib").mkdir(parents=True)
+    (tmp_path / "at" / "matplotlib" / "__init__.py").write_text("raise OSError('no\\nhome')")
+    env = {"MPLBACKEND": "module://nobody_has.this", "MATPLOTLIBRC": str(tmp_path / "matplotlibrc"),
+           "PATH": "/nowhere", **({"PYTHONPATH": str(tmp_path / "at")} if broken else {})}
+    done = run(*distill_arguments(files, "--out", "out", "--workers", "0"), cwd=tmp_path,
+               env={**ONE_THREAD, **env})
+    assert "return kept" in succeeded(done).stdout
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert result["picture"] == (not broken) == (tmp_path / "out" / "curve.png").exists()
+    assert ("curve.png: no picture: no home\n" in done.stderr) == broken
+
+
+def test_the_time_of_all_is_that_of_distilling_and_more(tmp_path, files, no_plots):
+    """Of a run that is given again, or was cut off, too."""
+    arguments = *distill_arguments(files, "--out", "out", "--workers", "0"), "--json"
+    first = last_json(run(*arguments, cwd=tmp_path, env=no_plots))
+    assert first["seconds_total"] >= first["seconds"]
+    header, arrays = fac.read_npz(path := tmp_path / "out" / "checkpoint.npz", ("checkpoint",))
+    fac.write_npz(path, {**header, "seconds": 5000.0}, arrays)
+    again = last_json(run(*arguments, cwd=tmp_path, env=no_plots))
+    assert 5000 <= again["seconds"] < again["seconds_total"] < 5000 + 120
+
+
+@pytest.mark.parametrize("closed", ["2>&-", ">&-", "<&- >&- 2>&-"])
+def test_streams_may_be_closed(tmp_path, files, closed):
+    """As by a daemon: files are written, by workers' work, too; a fault is still a status of 2."""
+    def shell(*arguments):
+        command = f'"$0" "$@" {closed}'
+        return subprocess.run(["sh", "-c", command, sys.executable, *map(str, arguments)],
+                              cwd=tmp_path, env={**os.environ, **ONE_THREAD}, timeout=120,
+                              capture_output=True, text=True)
+
+    (tmp_path / "expert.npz").write_bytes((files / "expert.npz").read_bytes())
+    done = shell(SCRIPT, "evaluate", "--model", "expert.npz", "--episodes", "2", "--workers", "1",
+                 "--record", *BUDGET)
+    assert done.returncode == 0, done.stderr
+    assert len(fac.read_records(tmp_path / "expert.npz")) == 1
+    done = shell(SCRIPT, "evaluate", "--model", "none.npz")
+    assert done.returncode == 2 and "Error" not in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("program", ["manipulator_demo.py", *(f"data/{name}.py" for name in (
+    "experiments", "export_golden", "import_expert", "train_expert"))])
+def test_programs_find_this_module_under_pythonsafepath(tmp_path, program):
+    code = (f"import runpy, sys; sys.argv = ['x', '--help']\n"
+            f"try: runpy.run_path({str(ROOT / program)!r}, run_name='__main__')\n"
+            f"except SystemExit as end: assert not end.code\n"
+            f"assert sys.modules['fac_tdmpc_ref'].__file__ == {str(SCRIPT)!r}")
+    succeeded(launch(["-c", code], tmp_path, {"PYTHONSAFEPATH": "1"}))
+
+
+def test_a_folder_whose_name_is_not_ascii(tmp_path, files):
+    """Under a locale that can't say it, too."""
+    (folder := tmp_path / "h\u00e9 \u5b66" / "data").mkdir(parents=True)
+    for path in (SCRIPT, ROOT / "data" / "reacher.xml"):
+        (folder.parent / path.relative_to(ROOT)).write_bytes(path.read_bytes())
+    for name in ("expert", "replay"):
+        (folder / f"{name}.npz").write_bytes((files / f"{name}.npz").read_bytes())
+    for env in ({}, {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}):
+        done = launch([folder.parent / SCRIPT.name, "evaluate", "--model", folder / "expert.npz",
+                       "--episodes", "1", "--workers", "1", *BUDGET], tmp_path,
+                      {**ONE_THREAD, "PYTHONIOENCODING": "", **env})
+        assert "reacher-hard" in succeeded(done).stdout
+
+
+def test_numpy_may_be_set_to_raise(tmp_path, files):
+    """And Python's warnings to errors: planning and distilling go on where an exp underflows."""
+    expert, _ = fac.load_model(files / "expert.npz")
+    for key in expert.params:
+        expert.params[key] = 40 * expert.params[key]
+    config = fac.DistillConfig(steps=4, batch_size=4, horizon=1, held_out=0.34, expert_episodes=0,
+                               lr=1e-6)
+    with np.errstate(all="raise"), warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        fac.Planner(expert, fac.PlannerConfig(samples=8)).act(np.full(8, 1e3))
+        distiller = fac.Distiller(expert, fac.Replay(files / "replay.npz"), config)
+        for _ in distiller.run():
+            pass
+        fac.rank_results(distiller, 8, 0.99)
+        distiller.close()
+        assert fac.compact(np.array([[1e9], [1.0]])).dtype == np.float32
+        with pytest.raises(FloatingPointError):  # the caller's setting stays
+            np.exp(np.float32(-1e3))
+
+
+def test_a_script_on_standard_input_may_have_workers(tmp_path):
+    code = ("import numpy as np, fac_tdmpc_ref as fac\n"
+            "model = fac.WorldModel.create(fac.ModelConfig(8, 3, 3, 4, 8, 8), "
+            "np.random.default_rng(0))\n"
+            "with fac.Planner(model, fac.PlannerConfig(samples=8), workers=1) as planner:\n"
+            "    print(planner.act(np.zeros(8)).shape)\n")
+    done = subprocess.run([sys.executable, "-"], input=code, capture_output=True, text=True,
+                          cwd=ROOT, timeout=60, env={**os.environ, **ONE_THREAD})
+    assert succeeded(done).stdout == "(3,)\n"
+
+
+def test_progress_goes_to_whatever_stands_for_stderr(monkeypatch):
+    written = []
+    for stream in (None, SimpleNamespace(write=written.append, flush=lambda: None)):
+        monkeypatch.setattr(sys, "stderr", stream)
+        with fac.progress("playing", 3, "decision") as bar:
+            bar.update(3)
+    assert "playing" in "".join(written)
+
+
 def test_distill_writes_its_results_and_nothing_else(distilled):
     done, folder = distilled
     pictures = ["curve.png"] if importlib.util.find_spec("matplotlib") else []
@@ -567,7 +678,8 @@ def test_a_killed_run_whose_expert_plays_goes_on(tmp_path, files, no_plots):
     for stop in (3, 5):
         assert distill("parts", "--workers", "2", stop=stop).returncode == -signal.SIGKILL
     with np.load(tmp_path / "parts" / "checkpoint.npz") as file:
-        assert file["played"].shape == (2, fac.EPISODE_STEPS, 8 + 3)  # states and actions
+        assert file["played"].shape == (2 * fac.EPISODE_STEPS, 8 + 3)  # states and actions
+        assert file["lengths"].tolist() == [fac.EPISODE_STEPS] * 2
     succeeded(distill("parts"))
     assert student_of(tmp_path / "parts") == student_of(tmp_path / "whole")
     without = distill_arguments(files, "--out", tmp_path / "without")
@@ -781,7 +893,7 @@ def test_recorded_returns_stand_for_the_expert_in_distill(tmp_path, files, no_pl
     assert result["expert_returns"] == measured["returns"][:1]
     assert "expert (recorded)" in done.stdout and "student, N = 1" in done.stdout
     assert "evaluating the expert" not in done.stderr
-    assert "pip install 'fac-tdmpc-ref[plots]'" in done.stdout
+    assert "curve.png: no picture: this needs matplotlib: pip install" in done.stderr
     assert not (tmp_path / "out" / "curve.png").exists()
     with pytest.raises(ValueError):
         json.loads(done.stdout.splitlines()[-1])
@@ -900,7 +1012,7 @@ def test_the_readme_distils_an_expert_of_one_s_own(tmp_path, monkeypatch):
              action=rng.uniform(-1, 1, (180, 6)), continues=np.arange(180) % 9 < 8)
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     command = "import_expert.py model.pt --task walker-walk --out mine --collect 20"
-    assert command in text and "--replay FILE.npz" in text
+    assert command in text and "--replay FILE`" in text
     arguments = command.replace("--collect 20", "--replay data.npz").split()[1:]
     assert import_expert.main(arguments) == 0
     *_, written = re.findall(r"```python\n(.*?)```", text, re.S)

@@ -388,14 +388,15 @@ def test_replay_that_is_not_finite(tmp_path, key, bad):
     value = replay_arrays()[key]
     value[100, 1] = bad
     path = write_replay(tmp_path / "r.npz", **{key: value})
-    refusal(lambda: fac.Replay(path), path, f"{key}:", "not finite")
+    refusal(lambda: fac.Replay(path), path, f"{key}: row 100, column 1: {bad} is not finite")
 
 
 def test_replay_whose_actions_are_out_of_range(tmp_path):
     value = replay_arrays()["action"]
     value[100, 1] = -1.01
     path = write_replay(tmp_path / "r.npz", action=value)
-    refusal(lambda: fac.Replay(path), path, "action:", "outside [-1, 1]")
+    refusal(lambda: fac.Replay(path), path, "action: row 100, column 1: -1.00",
+            "outside [-1, 1]")
 
 
 @pytest.mark.parametrize("continues", [np.ones(180, bool), np.arange(180) % 30 != 0])
@@ -424,21 +425,74 @@ def test_what_a_replay_holds(tmp_path):
 @given(lengths=st.lists(st.integers(1, 9), min_size=1, max_size=12), steps=st.integers(1, 5),
        held_out=st.sampled_from([0.01, 0.05, 0.2, 0.3, 0.5, 0.9]))
 def test_starts_stay_in_their_episode_and_no_episode_serves_both(lengths, steps, held_out):
-    """Compared with a plain loop. An episode of length l has l rows, l - 1 of them with actions."""
+    """Compared with a plain loop. An episode of length l has l rows, l - 1 of them with actions.
+    Where no share so small can be held out, a larger one is, up to a half."""
     replay = fac.Replay.__new__(fac.Replay)  # no file: only the rows' lengths matter
     replay.path, replay.ends = "replay", np.cumsum(lengths) - 1
     episode = np.repeat(np.arange(len(lengths)), lengths)
-    every = max(2, round(1 / held_out))
+    one, every = len(lengths) == 1, max(2, round(1 / held_out))
+    if one:  # its end is held out, as if it were another
+        cut = max(0, lengths[0] - 1 - max(steps, round(held_out * (lengths[0] - 1))))
+        episode = np.arange(lengths[0]) > cut
     possible = [row for row in range(len(episode))
-                if row + steps < len(episode) and episode[row] == episode[row + steps]]
-    expected = [[row for row in possible if (episode[row] % every == every - 1) == held]
-                for held in (False, True)]
+                if row + steps < len(episode) and (one or episode[row] == episode[row + steps])]
+    if one:
+        expected = [[row for row in possible if row + steps <= cut],
+                    [row for row in possible if row >= cut]]
+    for k in [] if one else range(every, 1, -1):
+        expected = [[row for row in possible if (episode[row] % k == k - 1) == held]
+                    for held in (False, True)]
+        if all(expected):
+            break
     if not all(expected):
-        refusal(lambda: replay.starts(steps, held_out), "replay", "too few", held_out)
+        refusal(lambda: replay.starts(steps, held_out), "replay", f"at least {steps} actions")
         return
     found = replay.starts(steps, held_out)
     assert [rows.tolist() for rows in found] == expected
-    assert not set(episode[found[0]]) & set(episode[found[1]])
+    assert one or not set(episode[found[0]]) & set(episode[found[1]])
+    assert not one or found[0].max() + steps <= found[1].min()
+
+
+def test_one_long_episode_is_held_out_by_time(tmp_path):
+    """A robot's log, D4RL's maze2d: of 179 actions the last tenth, no less than a sequence."""
+    path = write_replay(tmp_path / "r.npz", continues=np.arange(180) < 179)
+    kept, held = fac.Replay(path).starts(4, 0.1, seed=7)
+    assert (kept == np.arange(161 - 4 + 1)).all() and (held == np.arange(161, 176)).all()
+    kept, held = fac.Replay(path).starts(80, 0.1)
+    assert kept[-1] == 19 and held.tolist() == [99]
+    refusal(lambda: fac.Replay(path).starts(90, 0.1), path, "or one of 180")
+
+
+def test_a_replay_in_float32_is_taken_as_it_is(tmp_path):
+    arrays = replay_arrays()
+    seen = 1000 + np.float32(0.1) * arrays["observation"]
+    replay = fac.Replay(write_replay(tmp_path / "r.npz", observation=seen))
+    assert np.array_equal(replay.sequences(np.arange(9), 1)[0].T, seen[:9])
+    replay = fac.Replay(write_replay(tmp_path / "r.npz", action=arrays["action"].astype(F32)))
+    assert replay.action.dtype == F32
+
+
+@pytest.mark.parametrize("offset, scale, dtype", [
+    (0, 1, np.float16), (1, 0.1, np.float16), (1000, 0.1, F32), (0, 1e-9, F32), (0, 1e-30, F32),
+    (0, 1e5, F32), (1e5, 0, F32), (1000.3, 0, np.float16)])
+def test_what_float16_would_spoil_stays_float32(offset, scale, dtype):
+    """By a hundredth of a feature's deviation; a constant has nothing to lose but its size."""
+    rows = np.random.default_rng(0).standard_normal((500, 3)).astype(F32)
+    rows[:, 1] = offset + scale * rows[:, 1].astype(float)
+    kept = fac.compact(rows)
+    assert kept.dtype == dtype
+    if scale and dtype == F32:
+        assert np.array_equal(kept, rows)
+    elif scale:
+        assert ((kept - rows).std(0) < 0.01 * rows.std(0)).all()
+
+
+def test_a_weight_of_another_type_is_not_said_to_be_of_another_size(tmp_path, expert_file):
+    header, arrays = fac.read_npz(expert_file, ("expert",))
+    arrays["_Q1.3.bias"] = arrays["_Q1.3.bias"].astype(float)
+    fac.write_npz(tmp_path / "x.npz", header, arrays)
+    refusal(lambda: fac.load_model(tmp_path / "x.npz"), "_Q1.3.bias: expected float32, found "
+            "float64; data/import_expert.py converts it")
 
 
 def test_the_share_that_is_held_out(tmp_path):
@@ -527,6 +581,16 @@ def test_a_file_appears_complete_and_readable_by_all(tmp_path):
     assert path.stat().st_mode & 0o777 == 0o644
 
 
+@pytest.mark.parametrize("mask", [0o077, 0o002])
+def test_files_follow_the_umask(tmp_path, mask):
+    before = os.umask(mask)
+    try:
+        fac.write_json(tmp_path / "x.json", {})
+    finally:
+        os.umask(before)
+    assert (tmp_path / "x.json").stat().st_mode & 0o777 == 0o666 & ~mask
+
+
 def test_the_old_file_is_there_until_the_new_one_is(old_file):
     with fac.atomic_file(old_file, "w", newline="") as file:
         file.write("new\n")
@@ -543,13 +607,13 @@ def test_a_writer_that_fails_changes_nothing(old_file, error):
     assert untouched(old_file)
 
 
-@pytest.mark.parametrize("name", ["mkstemp", "replace"])
+@pytest.mark.parametrize("name", ["open", "replace"])
 def test_a_folder_that_can_not_be_written(old_file, monkeypatch, name):
     """Read-only, as the system would say it: permissions don't bind the superuser."""
     def refused(*_, **__):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
-    monkeypatch.setattr(fac.tempfile if name == "mkstemp" else fac.os, name, refused)
+    monkeypatch.setattr(fac if name == "open" else fac.os, name, refused, raising=False)
     refusal(lambda: fac.write_npz(old_file, {}, {}), old_file, "can't be written",
             "Permission denied")
     assert untouched(old_file)

@@ -207,6 +207,39 @@ def test_a_share_of_the_states_is_from_what_was_played(replay):
         next(distiller.run())
 
 
+def test_played_episodes_may_be_of_any_length(replay):
+    """NaN is past an end; sequences stay in their episode; those of H decisions serve nothing."""
+    config = fac.dataclasses.replace(CONFIG, encoder_input="observation", played_share=1.0,
+                                     policy_share=0.0, noise_std=1e-6)
+    lengths, begin = [7, 3, 4], np.array([0, 100, 200])
+    t = np.arange(9)
+    values = np.where(t < np.array(lengths)[:, None], begin[:, None] + t, np.nan)
+    with fresh(replay, config) as distiller:
+        distiller.add(*(np.repeat(x[..., None], n, 2) for x, n in ((values, 8), (values / 512, 3))))
+        distiller.add(np.full((1, 5, 8), 300), np.full((1, 5, 3), 300 / 512))
+        assert distiller.lengths.tolist() == [7, 4, 5]
+        (features,), actions, _ = distiller.draw(0, 0, 200)
+    assert set(features[0]) == {0, 1, 2, 3, 200, 300}
+    ramp = (features[0] < 300) * np.arange(4)[:, None]
+    np.testing.assert_allclose(actions[:, 0, :, 0], (features[0] + ramp) / 512, atol=1e-3)
+
+
+@pytest.mark.parametrize("array, at, value, part", [
+    (1, (1, 6, 0), 1.02, "1, decision 6:"), (0, (0, 2, 3), np.nan, "0, decision 2:"),
+    (0, (0, 9, 0), np.inf, "0, decision 9:"), (1, (1, 0, 0), -40, "outside [-1, 1]"),
+    (0, (slice(None), slice(3, 5)), np.nan, "0, decision 3:"),
+    (0, (slice(None), slice(3, 10)), np.nan, "none has 4 decisions")])
+def test_played_episodes_that_hold_anything_else_are_refused(replay, array, at, value, part):
+    episodes = np.zeros((2, 10, 8)), np.zeros((2, 10, 3))
+    episodes[array][at] = value
+    if part.startswith("none"):
+        episodes[1][at] = value
+    with fresh(replay, CONFIG) as distiller:
+        with pytest.raises(fac.UserError, match="played episodes: ") as caught:
+            distiller.add(*episodes)
+    assert part in str(caught.value)
+
+
 def ramp():
     """An episode: step t's observation is t, its action t / 512, both of which float16 holds."""
     t = np.arange(fac.EPISODE_STEPS + 1.0)[:, None]
@@ -239,7 +272,7 @@ def test_the_expert_s_policy_plays_first_with_noise_and_once(replay, tmp_path, m
     for _ in range(2):
         with fresh(replay, config) as distiller:
             fac.train_student(distiller, tmp_path, {"task": "x"}, fac.PlannerConfig(), 0)
-            assert len(distiller.played) == 3
+            assert len(distiller.lengths) == 3
     seeds = fac.training_seeds(0, "expert episode", 0, 3)
     assert len(set(seeds)) == 3 and len(seen) == 1
     assert seen[0][1:] == ("policy", 0, seeds, 0.6) and seen[0][0].has_policy
@@ -434,9 +467,6 @@ def test_hidden_layers_have_50_units_or_more(tmp_path):
 
 def test_what_diverges_stops(replay):
     with fresh(replay, CONFIG) as distiller:
-        episode = np.full((1, fac.EPISODE_STEPS, 8), 1e6), np.zeros((1, fac.EPISODE_STEPS, 3))
-        with pytest.raises(fac.UserError, match="played episodes: not finite"):
-            distiller.add(*episode)
         distiller.optimizer.vector[:] = np.nan
         with pytest.raises(fac.UserError, match="after update 1 the loss is no longer finite"):
             list(distiller.run())

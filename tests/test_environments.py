@@ -14,6 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 import fac_tdmpc_ref as fac  # noqa: E402
+import look  # noqa: E402
 import train_expert  # noqa: E402
 from test_planning import random_model  # noqa: E402
 
@@ -188,6 +189,120 @@ def test_an_environment_of_one_s_own_is_played_here_whatever_its_truth_value():
     assert obs[:, 0, 0].tolist() == [5, 7] and rewards.sum(1).tolist() == [500, 500]
 
 
+# robots of one's own ------------------------------------------------------------------
+
+SMALL = fac.PlannerConfig(samples=2, iterations=1, horizon=0)
+
+
+class Robot:
+    """Counts its decisions in feature 0; `answer(t)` is what step gives beside the observation.
+
+    It returns the array that it keeps its state in, and scales the action that it is given."""
+
+    dim_obs, dim_action = 3, 2
+
+    def __init__(self, answer=lambda t: (1.0,)):
+        self.state, self.answer = np.zeros(3), answer
+
+    def reset(self, seed):
+        self.state[:] = 0, seed, 0
+        return self.state
+
+    def step(self, action):
+        self.state[0] += 1
+        self.state[2] = action[0]
+        action *= 40
+        return self.state, *self.answer(int(self.state[0]))
+
+
+def play_robot(robot, seeds=(5, 7), config=SMALL, **options):
+    model = fac.WorldModel.create(fac.ModelConfig(3, 2, 2, 2, 4, 4), np.random.default_rng(0))
+    return fac.play(model, None, config, list(seeds), environment=robot, **options)
+
+
+def test_what_a_robot_does_to_its_arrays_reaches_no_record():
+    obs, actions, *_ = play_robot(Robot())
+    assert (obs[..., 0] == np.arange(500)).all() and (obs[..., 1] == [[5], [7]]).all()
+    assert np.abs(actions).max() <= 1 and np.array_equal(obs[:, 1:, 2], actions[:, :-1, 0])
+    episode = train_expert.Episode(Robot(), 3)
+    episode.play(None, 6)
+    obs, actions, reward = episode.arrays()
+    assert obs[:, 0].tolist() == [*range(7)] and np.abs(actions).max() <= 1
+    assert np.array_equal(obs[1:, 2], actions[:, 0]) and reward.tolist() == [1] * 6
+
+
+def test_an_environment_changes_no_action_and_returns_its_own_arrays():
+    from baselines import DecodingEnvironment
+    from experiments import DisturbedEnvironment
+    for env in (environment("reacher-easy"), DisturbedEnvironment("reacher-easy", 1, "noise"),
+                DecodingEnvironment("reacher-easy", SimpleNamespace(encode=lambda obs: obs[None]),
+                                    SimpleNamespace(decode=lambda s, a: a))):
+        first, action = env.reset(0), np.float32([0.5, -0.5, 0.25])
+        seen = [first, *(env.step(action)[0] for _ in range(3))]
+        assert action.tolist() == [0.5, -0.5, 0.25] and len({obs.tobytes() for obs in seen}) == 4
+
+
+def test_an_episode_is_as_long_as_the_robot_says():
+    """By a third value of its step; the shorter one ends in NaN and rewards of 0."""
+    def lasting(decisions):
+        robot = Robot(lambda t: (1.0, t == decisions[robot.state[1]]))
+        return robot
+
+    obs, actions, rewards, seconds = play_robot(lasting({5: 30, 7: 12}))
+    assert obs.shape == (2, 30, 3) and actions.shape == (2, 30, 2) and seconds.shape == (2, 30)
+    assert rewards.sum(1).tolist() == [30, 12] and not rewards[1, 12:].any()
+    for values in (obs, actions):
+        assert np.isfinite(values[0]).all() and np.isfinite(values[1, :12]).all()
+        assert np.isnan(values[1, 12:]).all()
+    both = play_robot(lasting({5: 12, 7: 12}))
+    assert np.array_equal(both[0][1], obs[1, :12]) and both[0].shape == (2, 12, 3)
+    longer = Robot()
+    longer.episode_steps = 1201
+    assert play_robot(longer)[2].sum(1).tolist() == [1201] * 2
+
+
+def test_a_robot_that_begins_the_next_episode_by_itself_ends_the_one_before():
+    """dm_control's reward there is None."""
+    rewards = play_robot(Robot(lambda t: (None if t == 201 else 1.0,)))[2]
+    assert rewards.sum(1).tolist() == [200, 200] and rewards.shape == (2, 200)
+
+
+@pytest.mark.parametrize("answer, parts", [
+    (lambda t: (np.nan if t == 9 else 1.0,), ["decision 8:", "finite reward", "nan"]),
+    (lambda t: (None,), ["decision 0:", "finite reward", "None"]),
+    (lambda t: (np.ones(2),), ["decision 0:", "finite reward"]),
+    (lambda t: (), ["decision 0:", "(observation, reward)"]),
+    (lambda t: (1.0, False, False, {}), ["decision 0:", "(observation, reward)"])])
+def test_what_a_robot_answers_is_refused_by_decision(answer, parts):
+    with pytest.raises(fac.UserError) as caught:
+        play_robot(Robot(answer))
+    assert all(part in str(caught.value) for part in parts) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("obs, part", [(np.full(3, np.inf), "not finite"), (np.zeros(4), "(4,)"),
+                                       ({"position": 0.0}, "NumPy makes no array")])
+def test_an_observation_is_refused_by_decision(obs, part):
+    robot, answers = Robot(), iter([np.zeros(3)] * 4 + [obs])
+    robot.step = lambda action: (next(answers), 1.0)
+    with pytest.raises(fac.UserError, match="decision 4: observation") as caught:
+        play_robot(robot)
+    assert part in str(caught.value)
+
+
+@pytest.mark.parametrize("repeat, begin", [(2, False), (8, True)])
+def test_an_environment_says_that_its_episode_is_over(repeat, begin):
+    env = fac.Environment("reacher-easy", repeat)
+    if begin:
+        env.reset(0)
+        for _ in range(env.episode_steps):
+            env.step(np.zeros(3))
+    message = rf"is over \({1000 // repeat} decisions\).* call reset\(seed\)"
+    with pytest.raises(fac.UserError, match=message):
+        env.step(np.zeros(3))
+    env.reset(0)
+    env.step(np.zeros(3))
+
+
 def test_actions_are_scaled_to_the_action_spec(monkeypatch):
     from dm_control import suite
     low, high, received = np.array([-2.0, 0, 1, 5]), np.array([3.0, 10, 2, 7]), []
@@ -283,6 +398,33 @@ def test_a_bad_rendering_setting_is_explained():
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
     assert "MUJOCO_GL" in done.stdout and "'nonsense'" in done.stdout
     assert done.stdout.count("\n") == 1
+
+
+@pytest.mark.parametrize("before", [None, "egl"])
+@pytest.mark.parametrize("render", [False, True])
+def test_making_an_environment_leaves_the_variables_as_they_were(before, render):
+    """And MuJoCo's own renderer there, for a caller who draws in the same program."""
+    code = (f"import os; before = {before!r}; os.environ.pop('MUJOCO_GL', None)\n"
+            "if before: os.environ['MUJOCO_GL'] = before\n"
+            "import fac_tdmpc_ref as fac\n"
+            f"try: fac.Environment('reacher-hard', render={render})\n"
+            "except fac.UserError as error: print(error)\n"
+            "import mujoco; assert os.environ.get('MUJOCO_GL') == before\n"
+            "assert hasattr(mujoco, 'GLContext')")
+    done = python(code)
+    assert done.returncode == 0, done.stderr
+
+
+def test_an_environment_that_can_draw(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "")  # put back in the end
+    try:
+        look.choose_renderer()
+    except fac.UserError as error:
+        pytest.skip(str(error))
+    done = python("import fac_tdmpc_ref as fac\n"
+                  "print(fac.Environment('reacher-hard', render=True)"
+                  ".env.physics.render(8, 8).shape)")  # by what was chosen
+    assert done.stdout == "(8, 8, 3)\n", done.stderr
 
 
 # reacher ------------------------------------------------------------------------------
