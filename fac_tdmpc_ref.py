@@ -99,7 +99,7 @@ class PlannerConfig(Settings):
     horizon: int = field(3, "H of Equation 2; or a file's", least=0, most=EPISODE_STEPS - 1)
     discount: float = field(0.99, "gamma (Table 2); or a file's", least=0, most=1)
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)", above=0)
-    max_std: float = field(2.0, "largest and first one (Table 2); distill: [D9]", above=0)
+    max_std: float = field(2.0, "largest and first one (Table 2) [D9]", above=0)
     inverse_temperature: float = field(0.5, "an elite weighs exp(this * G) (Table 2)", above=0)
     momentum: float = field(0.1, "part of the old mean in the new (TD-MPC's code)", least=0, most=1)
     returns: str = field("fast", "Equation 2, plain or fast", choices=("fast", "plain"))
@@ -881,7 +881,7 @@ def planning_numbers(sizes, config):
 # ==== 7. Added to the paper: more states [D8], credit, a search around the policy [D9] =
 
 # how a student plans that was taught around its expert's policy, if its file says nothing else
-STUDENT_PLANNING = {"prior": "policy", "max_std": 0.25, "samples": 32, "iterations": 3,
+STUDENT_PLANNING = {"prior": "policy", "max_std": 0.15, "samples": 32, "iterations": 3,
                     "output": "mean"}
 
 
@@ -971,9 +971,6 @@ def teacher_of(model, config):
     return teacher
 
 
-WIDTHS = 0.05, 0.1, 0.15, 0.25  # of a search around the policy: no wider than what was taught
-
-
 def plan_gains(expert, model, config, obs, seed=0):
     """What plans of the expert or a student, `model`, are worth above what the expert's policy
     would do, in states obs (O, S): by the expert's own G, and by the model's (what they promise),
@@ -992,19 +989,13 @@ def plan_gains(expert, model, config, obs, seed=0):
     return [g[:, 0] - g[:, 1] for g in G]
 
 
-def search_width(distiller, config, states=128):
-    """The smallest deviation of WIDTHS with which a student's search gains, by the expert's G in
-    held-out states, no less than the best one less its standard error; and of each [width, mean
-    gain, its standard error, mean promise] [D9]."""
-    starts = stream(distiller.seed, "search width").choice(distiller.held_out_starts, states)
-    (obs, _), rows = distiller.replay.sequences(starts, 1), []
-    for width in WIDTHS:
-        gain, promise = plan_gains(distiller.expert, distiller.student, dataclasses.replace(
-            config, max_std=width, min_std=min(width, config.min_std)), obs, distiller.seed)
-        rows.append([width, *map(float, (gain.mean(), gain.std(ddof=1) / np.sqrt(states),
-                                         promise.mean()))])
-    _, gain, error, _ = max(rows, key=lambda row: row[1])
-    return next(row[0] for row in rows if row[1] >= gain - error), rows
+def search_gains(distiller, config, states=128):
+    """What a student's plans gain above the expert's policy by the expert's G in held-out states:
+    mean, standard error, and the mean that the student's own G promises."""
+    starts = stream(distiller.seed, "search gains").choice(distiller.held_out_starts, states)
+    obs, _ = distiller.replay.sequences(starts, 1)
+    gain, promise = plan_gains(distiller.expert, distiller.student, config, obs, distiller.seed)
+    return [float(x) for x in (gain.mean(), gain.std(ddof=1) / np.sqrt(states), promise.mean())]
 
 
 # ==== 8. The same, in less time =======================================================
@@ -2264,7 +2255,7 @@ def command_distill(args):
         for model, config in ((expert, own), (distiller.student, planning)):
             check_memory(planning_numbers(model.config, config), config, model.config)
         teacher_of(distiller.student, planning)  # what is missing is missed now
-        result, planning = distil_and_save(distiller, args, planning, header, out)
+        result = distil_and_save(distiller, args, planning, header, out)
         obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
         both = (expert, own), (distiller.student, planning)
         result.update(evaluate_both(*both, record, args))
@@ -2295,8 +2286,7 @@ def load_data(args):
 
 
 def distil_and_save(distiller, args, planning, header, out):
-    """Algorithm 1 to its end; writes student, curve and configuration. Returns result's part, and
-    the planning with the width of its search."""
+    """Algorithm 1 to its end; writes student, curve and configuration. Returns result's part."""
     student, config, replay = distiller.student, distiller.config, distiller.replay
     settings = {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
                 "distill": asdict(config), "data": data_checksums(distiller.expert, replay),
@@ -2311,20 +2301,17 @@ def distil_and_save(distiller, args, planning, header, out):
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
     curve, seconds, before = train_student(distiller, out, settings, planning, args.workers)
-    width, gains = planning.max_std, None
-    if planning.prior == "policy" and getattr(args, "PlannerConfig.max_std") is None:
-        width, gains = search_width(distiller, planning)
-    planning = dataclasses.replace(planning, max_std=width)
+    gains = search_gains(distiller, planning) if planning.prior == "policy" else None
     save_model(out / "student.npz", student, {
         "kind": "student", **settings, "training": header.get("training", {}),
         "planner": {name: getattr(planning, name) for name in STUDENT_PLANNING}})
     write_json(out / "config.json", {**settings, "planner": asdict(planning)})
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
             "steps": config.steps, "seconds": round(seconds, 1), "seconds_total": before,
-            "kl_reward": curve[-1][3], "kl_value": curve[-1][4], "search_width": width,
-            "plan_gains": gains, **rank_results(distiller, 256, planning.discount), "out": str(out),
+            "kl_reward": curve[-1][3], "kl_value": curve[-1][4], "plan_gains": gains,
+            **rank_results(distiller, 256, planning.discount), "out": str(out),
             "picture": drawn(draw_curve, out / "curve.png", curve,
-                             f"{args.task}, seed {args.seed}")}, planning
+                             f"{args.task}, seed {args.seed}")}
 
 
 def evaluate_both(expert, student, record, args):
@@ -2397,10 +2384,9 @@ def report(result, plannings, eval_seed):
           f" (standard error over {result['rank_correlation_episodes']} held-out episodes; "
           f"{known[-1]:.3f} in states of training), distilled in {result['seconds']:.0f} s, "
           f"{result['seconds_total']:.0f} s in all, {result['out']}/")
-    for width, gain, se, promise in result["plan_gains"] or ():
-        if width == result["search_width"]:
-            print(f"plans around the policy, deviation {width}: {gain:.2f} ± {se:.2f} above it by "
-                  f"the expert's G in held-out states, {promise:.2f} by the student's")
+    if result["plan_gains"]:
+        print("plans are worth {:.2f} ± {:.2f} above the policy's by the expert's G in held-out "
+              "states, {:.2f} by the student's".format(*result["plan_gains"]))
 
 
 def return_kept(student, expert):

@@ -49,7 +49,6 @@ def main(episodes=24, updates=400, steps=3000, out=Path("runs/own-robot")):
     distiller.add(*fac.expert_episodes(distiller, None, around, environment=robot))
     list(distiller.run())  # each step's losses
     distiller.close()
-    around = fac.dataclasses.replace(around, max_std=fac.search_width(distiller, around)[0])
     for kind, model, plan in (("expert", expert, planning), ("student", distiller.student, around)):
         fac.save_model(out / f"{kind}.npz", model, {"kind": kind, "planner": vars(plan)})
         returns = fac.play(model, None, plan, range(90, 96), environment=robot)[2].sum(1)

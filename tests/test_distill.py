@@ -397,26 +397,19 @@ def test_what_plans_gain_is_told_by_the_expert_and_promised_by_the_model(replay)
                                rtol=1e-4, atol=1e-5)
 
 
-def test_a_search_is_no_wider_than_gains_more_than_a_standard_error(replay, monkeypatch):
-    means = dict(zip(fac.WIDTHS, (0.1, 0.75, 0.7, 0.8)))
-    seen, spread = [], []
+def test_what_a_search_gains_is_told_of_held_out_states(replay, monkeypatch):
+    seen = []
 
     def gains(expert, model, config, obs, seed):
-        seen.append((model, obs.tobytes()))
-        scatter = (config.max_std == 0.25) * np.array([1, -1] * 8) * spread[-1]
-        return means[config.max_std] + scatter, np.full(16, config.max_std)
+        seen.append(obs)
+        return np.array([1.0, 3.0] * 8), np.full(16, config.max_std)
 
     monkeypatch.setattr(fac, "plan_gains", gains)
     with fresh(replay, CONFIG) as distiller:
-        for value, expected in ((0.0, 0.25), (0.28, 0.1), (0.4, 0.1), (2.9, 0.05)):
-            spread.append(value)
-            width, rows = fac.search_width(distiller, fac.PlannerConfig(prior="policy"), 16)
-            assert width == expected and [row[0] for row in rows] == list(fac.WIDTHS)
-        assert {model for model, _ in seen} == {distiller.student}
+        found = fac.search_gains(distiller, fac.PlannerConfig(prior="policy", max_std=0.3), 16)
         held = replay.observation[distiller.held_out_starts].astype(np.float32)
-    assert rows[3][1:] == pytest.approx([0.8, 2.9 * np.sqrt(16 / 15) / 4, 0.25])
-    ((_, obs),) = {(None, obs) for _, obs in seen}  # all in the same states, which were held out
-    assert all((held == o).all(1).any() for o in np.frombuffer(obs, np.float32).reshape(8, -1).T)
+    assert found == pytest.approx([2, np.sqrt(16 / 15) / 4, 0.3])
+    assert all((held == o).all(1).any() for o in seen[0].T)
 
 
 def test_a_step_learns_at_its_rate_and_clips_its_gradient(replay, monkeypatch):
