@@ -649,8 +649,8 @@ def report_curves(name, path, figures):
         panels = {f"{task}: {panel}": ({case: cases[case] for case in own if case in cases},
                                        levels[task])
                   for task, cases in found.items() for panel, own in FIGURE5.items()}
-    fac.drawn(draw_lines, figures / f"{name}.png", panels,
-              "decisions" if name == "figure12" else "gradient step")
+    draw_lines(figures / f"{name}.png", panels,
+               "decisions" if name == "figure12" else "gradient step")
     result = {task: {case: last(curve, ranks[task].get(case)) for case, curve in cases.items()}
               for task, cases in found.items()}
     for (task, _, case, _), own in rows.items():
@@ -716,7 +716,7 @@ def report_figure7(_, path, figures):
         if row:
             result.append(row)
             table.append(budget_cells(row))
-    fac.drawn(draw_lines, figures / "figure7.png", panels, "samples or iterations", "log")
+    draw_lines(figures / "figure7.png", panels, "samples or iterations", xscale="log")
     note = ("Budgets are chosen by every other episode; returns are of the others."
             if split == {True} else "Some rows hold no episode's return: there the budgets are "
             "chosen by the episodes that they are reported on.")
@@ -739,7 +739,7 @@ def report_figure8(_, path, figures):
     cells = {task: {case: {key: [float(row["return_mean"]) for row in found]
                            for key, found in values.items()} for case, values in cases.items()}
              for task, cases in measured.items()}
-    fac.drawn(draw_bars, figures / "figure8.png", cells, KINDS)
+    draw_bars(figures / "figure8.png", cells, KINDS)
     result, table = {}, []
     for task, cases in cells.items():
         both = set.intersection(*(set(values) for values in cases.values()))  # measured for all

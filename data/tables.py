@@ -50,7 +50,7 @@ def cell(found):
     return f"{found['mean']:.0f}{spread}{rank}{ms}"
 
 
-def draw_lines(path, panels, xlabel, xscale=None):
+def draw_lines(path, panels, xlabel, **axes):
     """A panel each {title: ({label: {x: [values]}}, level or None)}: mean and band (± sample
     deviation) over seeds; the level, an expert's, is a line across."""
     plt = fac.pyplot()
@@ -74,14 +74,14 @@ def draw_lines(path, panels, xlabel, xscale=None):
         if level is not None:
             ax.axhline(level, color="black", linewidth=0.8, linestyle=(0, (1, 3)), label="expert")
         ax.set(title=title, xlabel=xlabel, ylabel="episode return",
-               ylim=(0, 1.05 * ax.get_ylim()[1]), xscale=xscale or "linear")
-        if xscale:  # logarithmic: a tick for each point
+               ylim=(0, 1.05 * ax.get_ylim()[1]), **axes)
+        if axes:  # logarithmic: a tick for each point
             ax.set_xticks(x := sorted(set().union(*lines.values())), [f"{v:.0f}" for v in x])
             ax.minorticks_off()
         else:
             ax.locator_params("x", nbins=5)
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, fontsize=8)
-    fac.save_figure(path, figure)
+    fac.drawn(fac.save_figure, path, figure)
 
 
 # -------------------------------------------------------------------- Figure 7: equal return
@@ -233,4 +233,4 @@ def draw_bars(path, cells, kinds):
             ax.set(title=f"{task}: {what}", xlabel="action dimension", ylabel="episode return",
                    xticks=range(0, actions, 1 + actions // 20))
     figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    fac.save_figure(path, figure)
+    fac.drawn(fac.save_figure, path, figure)
