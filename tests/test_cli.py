@@ -1007,7 +1007,7 @@ def test_the_readme_distils_an_expert_of_one_s_own(tmp_path, monkeypatch):
              action=rng.uniform(-1, 1, (180, 6)), continues=np.arange(180) % 9 < 8)
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     command = "import_expert.py model.pt --task walker-walk --out mine --collect 20"
-    assert command in text and "--replay FILE`" in text
+    assert command in text and "--replay FILE" in text
     arguments = command.replace("--collect 20", "--replay data.npz").split()[1:]
     assert import_expert.main(arguments) == 0
     *_, written = re.findall(r"```python\n(.*?)```", text, re.S)

@@ -1001,7 +1001,8 @@ def write_student_rows(path, policy=(90.0, 110.0)):
         return [{"step": 9, "return_mean": np.mean(returns), "returns": returns,
                  "expert_returns": [200.0, 50.0], "policy_returns": policy, "minutes": 6.0,
                  "evaluation_seed": evaluation_seed, "ranks": {
-                     "rank_correlation_returns": [0.9, 0.5]}}
+                     "rank_correlation_returns": [0.9, 0.5], "plan_ms_expert": 9.0,
+                     "plan_ms_student_in_process": 2.0}}
                 for evaluation_seed, returns in ((1, second), (0, first))]
 
     small, full = ({"samples": s, "iterations": i, "steps": 9, "num_agents": 6}
@@ -1022,7 +1023,7 @@ def test_the_table_of_students_has_a_line_for_each_budget_and_columns_for_each_p
     assert row.pop("task") == "walker-run" and row.pop("MPPI") == "128 x 4" and row["N"] == "6"
     assert row["expert"] == "125 ± 75" and row["its policy alone"] == "100 ± 10"  # over episodes
     assert row["student, default"] == "88 ± 18"  # 100 and 75: over seeds, n - 1
-    assert row["worst, default"] == "140"        # of the episode that the expert solves
+    assert row["speed-up, one core, default"] == "4.5"
     assert row["kept, default"] == "0.70 (0.80 / 0.60)"
     assert row["kept, evaluation seed 1, default"] == "0.90 (1.00 / 0.80)"
     assert row["rank correlation of G, H = 0 / last, default"] == "0.90 / 0.50"
