@@ -971,33 +971,6 @@ def teacher_of(model, config):
     return teacher
 
 
-def plan_gains(expert, model, config, obs, seed=0):
-    """What plans of the expert or a student, `model`, are worth above what the expert's policy
-    would do, in states obs (O, S): by the expert's own G, and by the model's (what they promise),
-    two (S,)."""
-    with one_thread():
-        z, own, planner = expert.encode(obs), model.encode(obs), FastPlanner(model, config)
-        policy, plans = policy_plan(expert, z, config.horizon + 1, len(own)), []
-        first = policy * F32(config.prior == "policy")
-        for i, seeds in enumerate(seed_sequence(seed).spawn(obs.shape[1])):
-            planner.reset(seeds.spawn(len(own)))
-            plans.append(planner.search(own[:, :, i:i + 1], first[..., i])[0])
-        both = np.stack([np.stack(plans, -1), policy], -1).swapaxes(0, 1)  # (L, N, d, S, 2)
-        both = both.reshape(len(both), -1, *both.shape[3:])
-        G = [horizon_returns(*predict(*of, both), config.discount)[-1]
-             for of in ((expert, z), (model, own))]
-    return [g[:, 0] - g[:, 1] for g in G]
-
-
-def search_gains(distiller, config, states=128):
-    """What a student's plans gain above the expert's policy by the expert's G in held-out states:
-    mean, standard error, and the mean that the student's own G promises."""
-    starts = stream(distiller.seed, "search gains").choice(distiller.held_out_starts, states)
-    obs, _ = distiller.replay.sequences(starts, 1)
-    gain, promise = plan_gains(distiller.expert, distiller.student, config, obs, distiller.seed)
-    return [float(x) for x in (gain.mean(), gain.std(ddof=1) / np.sqrt(states), promise.mean())]
-
-
 # ==== 8. The same, in less time =======================================================
 
 def optimizer_state(adam):
@@ -2301,14 +2274,13 @@ def distil_and_save(distiller, args, planning, header, out):
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
     curve, seconds, before = train_student(distiller, out, settings, planning, args.workers)
-    gains = search_gains(distiller, planning) if planning.prior == "policy" else None
     save_model(out / "student.npz", student, {
         "kind": "student", **settings, "training": header.get("training", {}),
         "planner": {name: getattr(planning, name) for name in STUDENT_PLANNING}})
     write_json(out / "config.json", {**settings, "planner": asdict(planning)})
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
             "steps": config.steps, "seconds": round(seconds, 1), "seconds_total": before,
-            "kl_reward": curve[-1][3], "kl_value": curve[-1][4], "plan_gains": gains,
+            "kl_reward": curve[-1][3], "kl_value": curve[-1][4],
             **rank_results(distiller, 256, planning.discount), "out": str(out),
             "picture": drawn(draw_curve, out / "curve.png", curve,
                              f"{args.task}, seed {args.seed}")}
@@ -2384,9 +2356,6 @@ def report(result, plannings, eval_seed):
           f" (standard error over {result['rank_correlation_episodes']} held-out episodes; "
           f"{known[-1]:.3f} in states of training), distilled in {result['seconds']:.0f} s, "
           f"{result['seconds_total']:.0f} s in all, {result['out']}/")
-    if result["plan_gains"]:
-        print("plans are worth {:.2f} ± {:.2f} above the policy's by the expert's G in held-out "
-              "states, {:.2f} by the student's".format(*result["plan_gains"]))
 
 
 def return_kept(student, expert):

@@ -251,6 +251,24 @@ def command_figure9(args):
     return result
 
 
+def plan_gains(expert, model, config, obs, seed=0):
+    """What plans of the expert or a student, `model`, are worth above what the expert's policy
+    would do, in states obs (O, S): by the expert's own G, and by the model's (what they promise),
+    two (S,)."""
+    with fac.one_thread():
+        z, own, planner = expert.encode(obs), model.encode(obs), fac.FastPlanner(model, config)
+        policy, plans = fac.policy_plan(expert, z, config.horizon + 1, len(own)), []
+        first = policy * fac.F32(config.prior == "policy")
+        for i, seeds in enumerate(fac.seed_sequence(seed).spawn(obs.shape[1])):
+            planner.reset(seeds.spawn(len(own)))
+            plans.append(planner.search(own[:, :, i:i + 1], first[..., i])[0])
+        both = np.stack([np.stack(plans, -1), policy], -1).swapaxes(0, 1)  # (L, N, d, S, 2)
+        both = both.reshape(len(both), -1, *both.shape[3:])
+        G = [fac.horizon_returns(*fac.predict(*of, both), config.discount)[-1]
+             for of in ((expert, z), (model, own))]
+    return [g[:, 0] - g[:, 1] for g in G]
+
+
 def agreement(student, expert, obs, actions, rng, values=32):
     """Spearman's correlation of an agent's share of Q with the expert's Q when one action
     dimension takes other values: (A, B) of states obs (O, B), around actions (A, B)."""
@@ -284,7 +302,7 @@ def command_agreement(args):
     _, held_out = replay.starts(1, share, fac.count(header.get("seed", 0), f"{args.model}: seed"))
     obs, actions = replay.sequences(rng.choice(held_out, args.states), 1)
     known = agreement(student, expert, obs, actions[0], rng)
-    gain, promise = (x.mean().item() for x in fac.plan_gains(expert, student, config, obs)
+    gain, promise = (x.mean().item() for x in plan_gains(expert, student, config, obs)
                      ) if expert.has_policy else (None, None)
     played, done, rewards, _ = fac.play(student, task, config,
                                         fac.episode_seeds(args.seed, args.episodes))

@@ -10,7 +10,7 @@ import fac_tdmpc_ref as fac  # noqa: E402
 from tables import deviation, markdown, of_returns  # noqa: E402
 
 EVALUATION_SEEDS = (0, 1)
-MEASURED = ("rank_correlation", "plan_gains", "plan_ms")  # what a row keeps
+MEASURED = ("rank_correlation", "plan_ms")  # what a row keeps
 HEADS = ("student", "kept", "kept, evaluation seed 1", "speed-up, one core",
          "rank correlation of G, H = 0 / last", "minutes")
 FLAGS = {"samples": "plan-samples", "iterations": "plan-iterations", "num_agents": "num-agents"}

@@ -397,7 +397,6 @@ def test_distill_prints_json_and_a_table(distilled):
     assert "horizon 3 and 1" in table and "128 x 4" in table and "16 x 1" in table
     policy = np.mean(result["policy_returns"])
     assert len(result["policy_returns"]) == 1 and f"{policy:.0f} ± 0" in table
-    assert f"worth {result['plan_gains'][0]:.2f} ± {result['plan_gains'][1]:.2f}" in table
     header, _ = fac.read_npz(folder / "student.npz", ("student",))
     assert header["planner"] == {**fac.STUDENT_PLANNING, "samples": 16, "iterations": 1}
 
