@@ -626,11 +626,15 @@ def curves(rows, column="return_mean"):
 
 
 def expert_level(task, rows):
-    """The mean of an expert's recorded returns, planned as the runs were; None: no record."""
+    """The mean of an expert's recorded returns, planned as the runs were; None: no record, or the
+    runs are of another expert."""
     about = next((json.loads(settings) for own, _, _, settings in rows if own == task), {})
     if not (path := fac.DATA / task / "expert.npz").exists():
         return None
     expert, header = fac.load_model(path)
+    weights = fac.checksum(expert.params.values())
+    if about.get("data", [weights])[0] != weights:
+        return None
     key = fac.record_key(expert, planning_for(header, about), 0)
     returns, _ = fac.read_records(path).get(key, ([], {}))
     return float(np.mean(returns[:about.get("episodes")])) if returns else None

@@ -401,6 +401,17 @@ def test_distill_prints_json_and_a_table(distilled):
     assert header["planner"] == {**fac.STUDENT_PLANNING, "samples": 16, "iterations": 1}
 
 
+def test_part_one_alone_distils_and_goes_on_from_its_end(tmp_path, files):
+    """--plain: the loop and the planner that Part I reads; given again it is evaluated alone."""
+    arguments = distill_arguments(files, "--plain", "--workers", "0", "--json")
+    first, second = (last_json(succeeded(run(*arguments, cwd=tmp_path, env={}))) for _ in range(2))
+    assert first["student_returns"] == second["student_returns"] and first["kl_value"] > 0
+    header, _ = fac.read_npz(tmp_path / "runs/reacher-hard-0/student.npz", ("student",))
+    assert header["distill"]["targets"] == "joint" and header["distill"]["reuse"] == 1
+    assert header["planner"]["prior"] == "none"
+    refused(run(*arguments, "--targets", "credit", cwd=tmp_path), "--plain", "without --targets")
+
+
 @pytest.mark.parametrize("cores, seconds, workers, best", [
     (1, [4, 2], 0, 2000), (2, [4, 2, 1], 1, 1000), (2, [4, 2, 3], 0, 2000)])
 def test_distill_times_workers_only_where_there_are_cores(cores, seconds, workers, best,
