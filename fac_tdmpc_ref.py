@@ -173,6 +173,7 @@ MLP = ("linear", "elu", "linear", "elu", "linear")
 QNET = ("linear", "norm", "tanh", "linear", "elu", "linear")
 HEADS = (("_reward", MLP), ("_Q1", QNET), ("_Q2", QNET))
 NORM_EPS = 1e-5  # PyTorch's LayerNorm
+POLICY_STD, POLICY_CUT = 0.05, 0.3  # of TD-MPC's policy noise: deviation, and where it is cut
 
 
 def linear(x, W, b):
@@ -435,9 +436,10 @@ def run_heads(model, x, actions, tapes=None):
             .reshape(-1, L, B, K) for name, kinds in HEADS]
 
 
-def predict(model, z, actions):
+def predict(model, z, actions, tapes=None):
     """Global rewards and both Q at every step of a rollout: sums over agents, three (L, B, K)."""
-    return [shares.sum(0) for shares in run_heads(model, unroll(model, z, actions), actions)]
+    x = unroll(model, z, actions, tapes)
+    return [shares.sum(0) for shares in run_heads(model, x, actions, tapes)]
 
 
 def heads_backward(model, tapes, d_shares, grads):
@@ -641,7 +643,7 @@ def draw_elite(elites, scores, rngs):
 
 def policy_noise(shape, rng):
     """What TD-MPC adds to its policy's actions, where it learns and where it proposes."""
-    return np.clip(rng.standard_normal(shape, F32) * F32(0.05), -0.3, 0.3)
+    return np.clip(rng.standard_normal(shape, F32) * F32(POLICY_STD), -POLICY_CUT, POLICY_CUT)
 
 
 def policy_rollout(model, z, noise):
@@ -660,17 +662,14 @@ class AgentPlanner:
 
     def __init__(self, model, config):
         self.model, self.config = model, config
-        self.forget()
+        self.reset()
 
-    def forget(self):
-        """Let the next plan start from a mean of zero, as an episode's first does."""
+    def reset(self, seeds=()):
+        """Start an episode from a mean of zero; with SeedSequences, of agents, new streams."""
         sizes = self.model.config
         self.mean = np.zeros((sizes.num_agents, self.config.horizon + 1, sizes.agent_actions), F32)
-
-    def reset(self, seeds):
-        """Start an episode: `forget`, and draw from new streams, a SeedSequence for each agent."""
-        self.forget()
-        self.rngs = [np.random.Generator(np.random.SFC64(seed)) for seed in seeds]
+        if seeds:
+            self.rngs = [np.random.Generator(np.random.SFC64(seed)) for seed in seeds]
 
     def plan(self, z, prior=None):
         """z (N, m, 1) -> first actions (N, d). The mean, moved on by one, starts the next plan,
@@ -796,8 +795,7 @@ def check_settings(config):
         if not all(holds for _, holds in rules):
             refuse(config, f.name, " and ".join(words for words, _ in rules))
         object.__setattr__(config, f.name, cls(value))
-    check_together = TOGETHER.get(type(config))
-    for name, holds, rule in check_together(config) if check_together else ():
+    for name, holds, rule in TOGETHER.get(type(config), lambda _: ())(config):
         if not holds:
             refuse(config, name, rule)
 
@@ -946,13 +944,11 @@ def credit(expert, tapes, actions, predicted, agents):
 def credited_batch(expert, student, obs, actions, config, rng):
     """`perturbed_batch` with each agent's part of the expert's predictions; copy 0 is what
     `actions` say."""
-    perturbed, tapes, z = perturbed_actions(actions, config, rng), defaultdict(list), expert.encode(
-        obs)
+    perturbed, z = perturbed_actions(actions, config, rng), expert.encode(obs)
     perturbed[..., :1] = actions[..., :1]
-    x = unroll(expert, z, perturbed, tapes)
-    predicted = [shares.sum(0) for shares in run_heads(expert, x, perturbed, tapes)]
-    return student.features(obs, z), perturbed, credit(expert, tapes, perturbed, predicted,
-                                                       student.config.num_agents)
+    predicted = predict(expert, z, perturbed, tapes := defaultdict(list))
+    parts = credit(expert, tapes, perturbed, predicted, student.config.num_agents)
+    return student.features(obs, z), perturbed, parts
 
 
 def taught_batch(expert, student, obs, actions, config, rng):
@@ -1161,6 +1157,12 @@ class Distiller:
 class PlainDistiller(Distiller):
     """Part I's `distill` in a Distiller's place, for `distill --plain`."""
 
+    def __init__(self, expert, replay, config, num_agents=None, seed=0):
+        need((config.targets, config.policy_share, config.expert_episodes, config.reuse) ==
+             ("joint", 0, 0, 1), "--plain is Algorithm 1 alone: without --targets, "
+             "--policy-share, --expert-episodes and --reuse")
+        super().__init__(expert, replay, config, num_agents, seed)
+
     def load(self, state):
         """A state of the end; one that was cut off starts anew."""
         if state["step"] == self.config.steps:
@@ -1360,13 +1362,6 @@ class FastPlanner(AgentPlanner):
         keep_memory()
         super().__init__(model, config)
         self.fast = None if config.returns == "plain" else Returns(model)
-
-    def reset(self, seeds):
-        """An episode's start; without seeds the streams go on."""
-        if seeds:
-            super().reset(seeds)
-        else:
-            self.forget()
 
     def returns(self, z):
         return self.fast.start(z, self.config) if self.fast else super().returns(z)
@@ -2217,10 +2212,6 @@ def command_distill(args):
         **({"returns": "plain"} if args.plain else {})})
     planning = dataclasses.replace(planning, horizon=config.horizon)
     distiller_class = PlainDistiller if args.plain else Distiller
-    if args.plain:
-        need((config.targets, config.policy_share, config.expert_episodes, config.reuse) ==
-             ("joint", 0, 0, 1), "--plain is Algorithm 1 alone: without --targets, "
-             "--policy-share, --expert-episodes and --reuse")
     out = Path(args.out or f"runs/{args.task}-{args.seed}")
     record = read_records(path).get(record_key(expert, own, args.eval_seed), ([], {}))
     with contextlib.closing(distiller_class(expert, replay, config, args.num_agents,

@@ -170,14 +170,13 @@ class Learner:
     def load(self, arrays):
         """Go on from a `state`."""
         self.slow_vector[:] = arrays["slow"]
-        load_named("expert", self.optimizer, arrays)
-        load_named("policy", self.policy_optimizer, arrays)
+        for name, optimizer in (("expert", self.optimizer), ("policy", self.policy_optimizer)):
+            fac.load_optimizer(optimizer, unnamed(name, fac.optimizer_state(optimizer), arrays))
 
 
-def load_named(name, optimizer, arrays):
-    """Let an Adam go on from the state that `named` has put into arrays under this name."""
-    state = {key: arrays[f"{name} {key}"] for key in fac.optimizer_state(optimizer)}
-    fac.load_optimizer(optimizer, state)
+def unnamed(name, state, arrays):
+    """A state with the entries of `state`, which `named` has put into arrays under this name."""
+    return {key: arrays[f"{name} {key}"] for key in state}
 
 
 def named(name, state):

@@ -25,7 +25,7 @@ import numpy as np
 
 sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
 import fac_tdmpc_ref as fac  # noqa: E402
-from numpy_learner import ExpertConfig, Learner, load_named, named  # noqa: E402
+from numpy_learner import ExpertConfig, Learner, named, unnamed  # noqa: E402
 
 # for a few cores; hidden layers of 512, as in Table 2, make an update three times as dear
 TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
@@ -488,9 +488,10 @@ class Training:
             fac.same_settings(header["settings"], self.settings, path)
             self.learner.load(arrays)
             if self.student:
-                load_named("student", self.student.optimizer, arrays)
-                self.student.own.load({key: arrays[f"own {key}"]
-                                       for key in self.student.own.state()})
+                optimizer, own = self.student.optimizer, self.student.own
+                fac.load_optimizer(optimizer, unnamed("student", fac.optimizer_state(optimizer),
+                                                      arrays))
+                own.load(unnamed("own", own.state(), arrays))
             self.buffer.load(arrays)
             for key in ("decisions", "allowed", "seconds", "curve"):
                 setattr(self, key, header[key])

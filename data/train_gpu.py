@@ -78,18 +78,13 @@ class Stack:
         self.shapes = [found[n][0] for n in self.names]
         self.low, self._lengths = low, [a * b for a, b in self.shapes]
         self._hidden = sum(not fine for _, fine in found.values())
-        rows = [np.concatenate([self._pad(model.params[n][0], shape).ravel()
-                                for n, shape in zip(self.names, self.shapes)]) for model in models]
+        rows = [np.concatenate([np.pad(own := model.params[n][0], [
+            (0, wide - narrow) for wide, narrow in zip(shape, own.shape)]).ravel()
+            for n, shape in zip(self.names, self.shapes)]) for model in models]
         self.vector = torch.tensor(np.stack(rows), device=device, requires_grad=True)
         self.optimizer = torch.optim.Adam([self.vector], torch.tensor(config.lr, device=device),
                                           fused=True, capturable=device != "cpu")
         self._clip = config.grad_clip
-
-    @staticmethod
-    def _pad(array, shape):
-        out = np.zeros(shape, np.float32)
-        out[:array.shape[0], :array.shape[1]] = array
-        return out
 
     def views(self, vector=None):
         """{name: (T, rows, columns)} of this vector, or another one such."""
@@ -166,7 +161,7 @@ class Learner:
 
     def policy_noise(self, *shape):
         noise = self.torch.randn(*shape, self.dim_action, device=self.device)
-        return (noise * 0.05).clamp(-0.3, 0.3)  # fac.policy_noise
+        return (noise * fac.POLICY_STD).clamp(-fac.POLICY_CUT, fac.POLICY_CUT)
 
     def sample(self):
         """Segments drawn evenly: observations (H+1, T, B, O), actions (H, T, B, A), rewards."""
@@ -417,6 +412,7 @@ class Run:
     def save(self, out):
         """A folder for each task; returns `out`."""
         learner, args, held = self.learner, self.args, int(self.learner.filled)
+        count = min(args.replay, held)
         for i, (task, curve) in enumerate(zip(args.tasks, self.curves)):
             folder = Path(out) / (task if args.tasks.count(task) == 1 else f"{task}-{i}")
             folder.mkdir(parents=True, exist_ok=True)
@@ -430,7 +426,7 @@ class Run:
             fac.save_model(folder / "expert.npz", model, {"kind": "expert", **about}, True)
             episodes = ReplayBuffer(model.config.dim_obs, model.config.dim_action,
                                     args.replay * fac.EPISODE_STEPS)
-            for j in np.arange(min(args.replay, held)) * held // min(args.replay, held):
+            for j in np.arange(count) * held // count:
                 obs, action, reward = (x[i, j].cpu().numpy() for x in (
                     learner.obs, learner.action, learner.reward))
                 episodes.add(obs[:, :model.config.dim_obs], action[:, :model.config.dim_action],

@@ -827,6 +827,13 @@ def replay_arrays(episodes=20, rows=7, dtype=np.float64):
             "continues": continues}
 
 
+def refuse_replay(path, arrays, change, part):
+    """What `change` has done to arrays is refused, by file and `part`."""
+    change(arrays)
+    np.savez(path, **arrays)
+    refusal(lambda: import_expert.find_replay(path, SIZES), path.name, part)
+
+
 @pytest.mark.parametrize("dtype", [np.float64, np.float32, np.float16])
 def test_a_replay_is_converted_and_distils(tmp_path, dtype, capsys):
     arrays = replay_arrays(dtype=dtype)
@@ -866,10 +873,7 @@ def test_a_replay_is_converted_and_distils(tmp_path, dtype, capsys):
     (lambda a: a.clear(), "observation: not there"),
 ])
 def test_other_replays_are_refused(tmp_path, change, part):
-    arrays = replay_arrays()
-    change(arrays)
-    np.savez(tmp_path / "data.npz", **arrays)
-    refusal(lambda: import_expert.find_replay(tmp_path / "data.npz", SIZES), "data.npz", part)
+    refuse_replay(tmp_path / "data.npz", replay_arrays(), change, part)
 
 
 def test_what_is_not_needed_of_a_replay_is_not_read(tmp_path):
@@ -928,10 +932,7 @@ def test_d4rl_s_arrays_are_taken_by_their_names(tmp_path, suffix, kind):
     (lambda a: a.update(timeouts=a["timeouts"][1:]), "equally long"),
     (lambda a: a.pop("actions"), "action: not there")])
 def test_other_arrays_of_d4rl_are_refused(tmp_path, change, part):
-    arrays = d4rl_arrays()
-    change(arrays)
-    np.savez(tmp_path / "data.npz", **arrays)
-    refusal(lambda: import_expert.find_replay(tmp_path / "data.npz", SIZES), "data.npz", part)
+    refuse_replay(tmp_path / "data.npz", d4rl_arrays(), change, part)
 
 
 def test_an_hdf5_file_holds_its_own_bytes_and_no_more_than_it_has(tmp_path):
