@@ -94,6 +94,7 @@ def command_watch(args):
     if kind == ".mp4":
         with fac.optional("imageio for .mp4", "experiments"):
             import imageio_ffmpeg  # noqa: F401
+    choose_renderer()  # before a task's sizes are looked up in dm_control
     model, header, task = open_model(args)
     models = [(args.model, model, header)]
     if args.beside:
@@ -105,7 +106,6 @@ def command_watch(args):
              f"steps, {args.model} every {configs[0].action_repeat}: they can't be shown in step")
     fac.need(args.decisions <= configs[0].episode_steps, f"--decisions: an episode has "
              f"{configs[0].episode_steps}, not {args.decisions}")
-    choose_renderer()
     (seed,) = fac.episode_seeds(args.seed, 1, first=args.episode)
     episodes = [watch_episode(*found, task, seed, args.decisions, args.every)
                 for found in models]
@@ -137,6 +137,7 @@ def pyplot_for(path):
     return fac.pyplot()
 
 
+NOISE = fac.DistillConfig.noise_std  # around what is done, for the additive ceiling
 SMOOTH = 10  # decisions over which a change of the return counts
 
 
@@ -269,6 +270,29 @@ def plan_gains(expert, model, config, obs, seed=0):
     return [g[:, 0] - g[:, 1] for g in G]
 
 
+def additive_ceiling(expert, obs, actions, noise, discount, rng, copies=1024):
+    """How well a sum over action dimensions can know the expert's G at all, around actions
+    (L, A, B) of states obs (O, B), for each H: rank correlation, and share of G's variance: two
+    (L, B). noise: deviation of the perturbations.
+
+    In each state a quadratic of each dimension's own actions, up to H, is fitted to three quarters
+    of the copies, and measured on the others."""
+    config = fac.DistillConfig(noise_samples=copies, noise_std=noise)
+    found, cut = np.zeros((2, len(actions), obs.shape[1])), copies * 3 // 4
+    for b in range(obs.shape[1]):
+        perturbed = fac.perturbed_actions(actions[..., b:b + 1, None], config, rng)
+        predicted = fac.predict(expert, expert.encode(obs[:, b:b + 1]), perturbed)
+        way = (perturbed[:, :, 0] - actions[..., b, None]).swapaxes(0, 1).astype(float)  # (A, L, K)
+        for H, G in enumerate(fac.horizon_returns(*predicted, discount)[:, 0].astype(float)):
+            i, j = np.triu_indices(H + 1)
+            x = np.concatenate([way[:, :H + 1], way[:, i] * way[:, j]], 1).reshape(-1, copies).T
+            x = np.concatenate([x, np.ones_like(x[:, :1])], 1)
+            weights, *_ = np.linalg.lstsq(x[:cut], G[:cut], rcond=None)
+            known, G = x[cut:] @ weights, G[cut:]
+            found[:, H, b] = fac.spearman(known, G), 1 - np.var(G - known) / np.var(G)
+    return found
+
+
 def agreement(student, expert, obs, actions, rng, values=32):
     """Spearman's correlation of an agent's share of Q with the expert's Q when one action
     dimension takes other values: (A, B) of states obs (O, B), around actions (A, B)."""
@@ -299,9 +323,13 @@ def command_agreement(args):
     config = fac.PlannerConfig(**fac.made_for(header, args.model))
     about = {k: v for k, v in (header.get("distill") or {}).items() if k == "held_out"}
     share = fac.from_dict(fac.DistillConfig, about, args.model).held_out
-    _, held_out = replay.starts(1, share, fac.count(header.get("seed", 0), f"{args.model}: seed"))
-    obs, actions = replay.sequences(rng.choice(held_out, args.states), 1)
+    L, seed = config.horizon + 1, fac.count(header.get("seed", 0), f"{args.model}: seed")
+    _, held_out = replay.starts(L, share, seed)
+    obs, actions = replay.sequences(rng.choice(held_out, args.states), L)
     known = agreement(student, expert, obs, actions[0], rng)
+    with fac.one_thread():
+        ceiling, explained = additive_ceiling(expert, obs[:, :24], actions[..., :24], NOISE,
+                                              config.discount, rng).mean(-1).tolist()
     gain, promise = (x.mean().item() for x in plan_gains(expert, student, config, obs)
                      ) if expert.has_policy else (None, None)
     played, done, rewards, _ = fac.play(student, task, config,
@@ -322,10 +350,12 @@ def command_agreement(args):
     result = {"out": args.out, "task": task, "held_out": known.mean(1).tolist(),
               "worst_episode": own.mean(1).tolist(), "when": when.tolist(),
               "return_worst": float(rewards[worst].sum()), "plan_gain": gain,
-              "plan_promise": promise}
+              "plan_promise": promise, "ceiling": ceiling, "ceiling_variance": explained}
     fac.print_table([("joint", *map(str, range(len(own)))), *(
         (name, *(f"{x:.2f}" for x in result[key]))
         for name, key in (("held-out states", "held_out"), ("worst episode", "worst_episode")))])
+    print(f"no sum over action dimensions can rank the expert's G better than "
+          f"{', '.join(f'{x:.2f}' for x in ceiling)} (H = 0, 1, ...; noise of {NOISE})")
     if expert.has_policy:
         print(f"a plan promises {promise:.2f} above the expert's policy, by the student's G; by "
               f"the expert's it is worth {gain:.2f}")
