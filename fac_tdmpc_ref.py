@@ -142,11 +142,13 @@ class DistillConfig(Settings):
     encoder_input: str = field("latent", "the encoder reads the expert's latent or the observation "
                                "[D3]", paper="observation", choices=("latent", "observation"))
     lr: float = field(1e-3, "Adam's learning rate [D1]", paper=1e-4, above=0)
-    lr_schedule: str = field("cosine", "[D1]", paper="constant", choices=("cosine", "constant"))
+    lr_schedule: str = field("cosine", "it falls to 0 like half a cosine, or stays [D1]",
+                             paper="constant", choices=("cosine", "constant"))
     warmup: int = field(200, "steps over which lr rises from zero [D1]", paper=0, least=0)
     grad_clip: float = field(10.0, "largest gradient norm (Table 2)", above=0)
     expert_episodes: int = field(96, "that its policy plays first [D8]", paper=0, plain=0, least=0)
-    played_share: float = field(0.5, "of states [D8]", paper=0.0, plain=0.0, least=0, most=1)
+    played_share: float = field(0.5, "share of states that are from these episodes [D8]",
+                                paper=0.0, plain=0.0, least=0, most=1)
     held_out: float = field(0.1, "share of episodes to measure ranks in", least=1e-4, most=0.5)
 
 
@@ -453,8 +455,7 @@ def heads_backward(model, tapes, d_shares, grads):
 
 
 def unroll_backward(model, tapes, actions, dx, grads):
-    """Walk `unroll` back from its x's gradient dx, overwritten: adds to `grads`, returns dz
-    (N, m, B)."""
+    """Walk `unroll` back from its x's gradient dx, used up: adds to `grads`; dz (N, m, B)."""
     (L, _, B, K), n, m = actions.shape, model.config.num_agents, model.config.latent_dim
     for h in reversed(range(L - 1)):
         now, after = (slice(i * B * K, (i + 1) * B * K) for i in (h, h + 1))
@@ -495,8 +496,7 @@ def distill_loss(student, features, actions, targets, config, grads=None, diverg
     features (1, F, B): what the student's encoder reads in the first states; actions
     (L, A, B, K): perturbed; targets: the expert's `predict` for them, three (L, B, K), or each
     agent's part of these (`credit`), (N, L, B, K): D is summed over agents then. divergence: D, as
-    `soft_kl`. Returns the loss and the mean divergences of reward and value over steps and states.
-    """
+    `soft_kl`. Returns loss and mean divergences of reward and value over steps and states."""
     tapes, encoder_tape = defaultdict(list), []
     z = student.encode_features(features, encoder_tape)
     x = unroll(student, z, actions, tapes)
