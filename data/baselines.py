@@ -31,13 +31,13 @@ class MSEDistiller(fac.Distiller):
     loss = staticmethod(functools.partial(fac.distill_loss, divergence=squared_error))
 
 
-def consistency_loss(student, features, actions, targets, config, grads=None):
-    """Equation 4 and, with weight 2 (TD-MPC's; Table 2 has 0), TD-MPC's consistency.
+def consistency_loss(student, features, actions, targets, config, grads=None, weight=2.0):
+    """Equation 4 and, with a weight of 2 (TD-MPC's; Table 2 has 0), TD-MPC's consistency.
 
     That is the mean of |s_{h+1} - f_E(g_{h+1})|^2 over features, with the student's encoding,
     held fixed, of the last of `targets`: what the student reads of the expert's own rollout."""
     *targets, after = targets  # (F, L, B, K)
-    tapes, encoder_tape, end_tape, weight = defaultdict(list), [], [], 2.0
+    tapes, encoder_tape, end_tape = defaultdict(list), [], []
     z = student.encode_features(features, encoder_tape)
     L, _, B, K = actions.shape
     x = fac.unroll(student, z, actions, tapes)
@@ -69,6 +69,12 @@ class ConsistentDistiller(fac.Distiller):
         x = fac.unroll(self.expert, features, actions)
         after = latents_after(self.expert, x, np.prod(columns))
         return features, actions, [*targets, after.reshape(-1, steps, *columns)]
+
+
+class LightlyConsistentDistiller(ConsistentDistiller):
+    """The same with a weight that leaves most of the loss to Equation 4."""
+
+    loss = staticmethod(functools.partial(consistency_loss, weight=0.03))
 
 
 def small_distiller(expert, replay, config, _, seed):
@@ -188,4 +194,5 @@ class DecodingEnvironment(fac.Environment):
 def distiller_of(case):
     """What learns in a case of Figure 4 or 5; most differ from the default by settings alone."""
     return {"MSE": MSEDistiller, "consistency": ConsistentDistiller, "TAP": TapDistiller,
+            "consistency 0.03": LightlyConsistentDistiller,
             "10% TD-MPC": small_distiller}.get(case, fac.Distiller)

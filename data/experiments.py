@@ -298,7 +298,7 @@ FIGURE5 = {  # panel: {case: settings}; every panel holds the default
     "noise deviation": {"default": {}, **{f"noise {x}": {"noise_std": x} for x in (0.1, 1.0, 2.0)}},
     "student temperature": {"default": {}, **{f"T_s {x}": {"temperature_student": x}
                                               for x in (0.1, 2.0)}},
-    "consistency": {"default": {}, "consistency": {}}}
+    "consistency": {"default": {}, "consistency": {}, "consistency 0.03": {}}}
 FIGURE5_CASES = {case: settings for panel in FIGURE5.values() for case, settings in panel.items()}
 
 

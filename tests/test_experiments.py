@@ -440,7 +440,8 @@ def loss_inputs(dtype=np.float64):
             [*targets, rng.standard_normal((4, 3, 4, 3))])
 
 
-@pytest.mark.parametrize("kind", [baselines.MSEDistiller, baselines.ConsistentDistiller])
+@pytest.mark.parametrize("kind", [
+    baselines.MSEDistiller, baselines.ConsistentDistiller, baselines.LightlyConsistentDistiller])
 def test_gradients_of_the_other_losses(kind, monkeypatch):
     student, features, actions, targets = loss_inputs()
     config = fac.DistillConfig(horizon=2, lam=0.7)
@@ -723,6 +724,7 @@ def test_the_cases_of_figure_5_learn_what_they_say():
              for case in panel}
     assert kinds.pop("MSE") is baselines.MSEDistiller
     assert kinds.pop("consistency") is baselines.ConsistentDistiller
+    assert kinds.pop("consistency 0.03") is baselines.LightlyConsistentDistiller
     assert set(kinds.values()) == {fac.Distiller} and len(kinds) == 6
     assert {k: v for k, v in experiments.FIGURE5_CASES.items() if v} == {
         "MSE": {"targets": "joint"},  # values, not what changes them
