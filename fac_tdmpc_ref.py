@@ -1600,6 +1600,35 @@ def import_dm_control(render=False):
     return suite, control, reacher
 
 
+GYM = "gym:"  # before a task's ID in Gymnasium
+
+
+def make_robot(task, action_repeat=None):
+    """The robot of a task: dm_control's, an `Environment`, or data/gym_robot.py's of gym:ID."""
+    repeat = task_repeat(task) if action_repeat is None else action_repeat
+    if not str(task).startswith(GYM):
+        return Environment(task, repeat)
+    if str(DATA) not in sys.path:
+        sys.path.append(str(DATA))
+    with optional("gymnasium, and a clone of the repository", "gym"):
+        from gym_robot import GymRobot
+    try:
+        return GymRobot(task[len(GYM):], repeat)
+    except ValueError as error:
+        raise UserError(f"{task}: {error}") from None
+
+
+def task_repeat(task):
+    """A task's control steps a decision, where a file or a setting names no others."""
+    return 1 if str(task).startswith(GYM) else ACTION_REPEAT
+
+
+def task_steps(task, config):
+    """T: decisions in an episode of a task, at most, planned for with a PlannerConfig."""
+    return make_robot(task, config.action_repeat).episode_steps if str(task).startswith(GYM) else (
+        config.episode_steps)
+
+
 class Environment:
     """One of the paper's 11 tasks, or another one of dm_control's suite.
 
@@ -1611,6 +1640,8 @@ class Environment:
     def __init__(self, task, action_repeat=ACTION_REPEAT, render=False):
         self.action_repeat, self.episode_steps = action_repeat, episode_steps(action_repeat)
         domain, name, self.dim_obs, self.dim_action = lookup_task(task)
+        need(not str(task).startswith(GYM), f"{task}: distill, evaluate and train_expert.py play "
+             "Gymnasium's; expected one of dm_control's here")
         suite, control, reacher = import_dm_control(render)
         if domain == "reacher":
             need(REACHER.exists(), f"{REACHER}: no such file; run from a clone of the repository")
@@ -1643,27 +1674,33 @@ class Environment:
 
 
 def robot_step(robot, action, sizes, t):
-    """Decision t of an episode: next observation (O,), reward, whether it is over. What goes to and
-    fro is copied. A robot's third value, if any, tells the end, or dm_control's reward of None: the
-    next episode has begun, and all of this is none of ours. UserError: what isn't finite."""
-    obs, reward, *over = robot.step(np.array(action))
-    need(len(over) < 2, f"decision {t}: expected (observation, reward), or a third, the end")
+    """Decision t of an episode: next observation (O,), reward, whether it is over, and whether by
+    its state, beyond which nothing is worth anything: a robot's third value, if any; a fourth tells
+    that the time is over. dm_control's reward of None: the next episode has begun, and all of this
+    is none of ours. What goes to and fro is copied. UserError: what isn't finite."""
+    obs, reward, *ends = robot.step(np.array(action))
+    need(len(ends) < 3, f"decision {t}: expected (observation, reward), or also whether the state "
+         "ended the episode, and whether the time did")
     if reward is None and t:
-        return None, None, True
+        return None, None, True, False
     reward = np.asarray(reward, float)  # None is NaN
     need(reward.size == 1 and np.isfinite(reward).all(), f"decision {t}: expected a finite reward, "
          f"found {reward}")
-    return observed(obs, sizes, f"decision {t}: observation"), reward.item(), any(over)
+    obs = observed(obs, sizes, f"decision {t}: observation")
+    return obs, reward.item(), any(ends), any(ends[:1])
 
 
 def task_names():
     """What a task may be, for --help and errors."""
-    return f"{', '.join(TASKS)}, or another DOMAIN-TASK of dm_control's suite"
+    return f"{', '.join(TASKS)}, another DOMAIN-TASK of dm_control's suite, or gym:ID of Gymnasium"
 
 
 def lookup_task(task):
     """(domain, name, dim O, dim A) of a task; UserError with the nearest name otherwise."""
     task = str(task)
+    if task.startswith(GYM):
+        robot = make_robot(task)
+        return *task.split(":", 1), robot.dim_obs, robot.dim_action
     return *task.split("-", 1), *(TASKS[task] if task in TASKS else suite_sizes(task))
 
 
@@ -1827,8 +1864,8 @@ def made_for(header, where):
         settings = {name: settings[name] for name in names if name in settings}
         from_dict(PlannerConfig, settings, f"{there}: {group}")
         found.update(settings)
-    if "action_repeat" in header:
-        found["action_repeat"] = header["action_repeat"]
+    if "action_repeat" in header or str(header.get("task")).startswith(GYM):
+        found["action_repeat"] = header.get("action_repeat", 1)
     from_dict(PlannerConfig, found, there)
     return found
 
@@ -1919,7 +1956,7 @@ def decisions(model, task, config, seeds, environment=None, noise=0.0):
     (A,), reward and seconds of planning; past its end up to T NaN, reward 0. environment: instead
     of the task's, see `robot_step`; with T as `episode_steps` if it has that. noise: each episode
     draws the deviation of what is added to its actions, evenly from 0 to this."""
-    environment = Environment(task, config.action_repeat) if environment is None else environment
+    environment = make_robot(task, config.action_repeat) if environment is None else environment
     planner, sizes = Planner(model, config), model.config
     past = np.full(sizes.dim_obs, np.nan), np.full(sizes.dim_action, np.nan), 0.0, np.nan
     for seed in seeds:
@@ -1936,7 +1973,7 @@ def decisions(model, task, config, seeds, environment=None, noise=0.0):
             if noise:
                 action = action + deviation * rng.standard_normal(action.shape, F32)
                 action = np.clip(action, -1, 1)
-            before, (obs, reward, over) = obs, robot_step(environment, action, sizes, t)
+            before, (obs, reward, over, _) = obs, robot_step(environment, action, sizes, t)
             yield past if obs is None else (before, action, reward, seconds)
 
 
@@ -1955,7 +1992,8 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
 
     workers: processes that share the episodes [one for each core]; 0, or with an `environment`: all
     in this one. An episode depends on its seed, not on their number. noise: as `decisions`'s."""
-    T = getattr(environment, "episode_steps", config.episode_steps)
+    T = (task_steps(task, config) if environment is None else
+         getattr(environment, "episode_steps", config.episode_steps))
     E, sizes = len(seeds), model.config
     at_once = math.gcd(T, 25)  # decisions of a worker's message: of one episode
     found = [np.zeros((E, T, *shape), F32) for shape in ((sizes.dim_obs,), (sizes.dim_action,))]
@@ -1988,7 +2026,7 @@ def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="eval
     check_task(model.config, task)
     *_, rewards, seconds = play(model, task, config, episode_seeds(seed, episodes), workers, label)
     return {"returns": rewards.sum(1).tolist(),
-            "plan_ms_median": 1e3 * float(np.median(seconds.mean(1)))}
+            "plan_ms_median": 1e3 * float(np.median(np.nanmean(seconds, 1)))}
 
 
 def check_task(sizes, task, what="the model"):
@@ -2242,7 +2280,7 @@ def load_data(args):
     need(header.get("task") == args.task, f"{path}: header: task: expected {args.task!r}, found "
          f"{header.get('task')!r}")
     check_task(expert.config, args.task)
-    Environment(args.task)  # what is missing is missed now, not after the last step
+    make_robot(args.task)  # what is missing is missed now, not after the last step
     replay = Replay(args.replay or path.with_name("replay.npz"))
     repeat = made_for(header, path).get("action_repeat", ACTION_REPEAT)
     found = made_for(replay.header, replay.path).get("action_repeat", repeat)
@@ -2366,8 +2404,8 @@ def print_table(rows):
 def command_evaluate(args):
     """evaluate: a model's returns on a task."""
     model, header = load_model(args.model)
-    planning = from_args(PlannerConfig, args, **made_for(header, args.model))
     need(task := args.task or header.get("task"), f"{args.model}: header: no task; pass --task")
+    planning = from_args(PlannerConfig, args, **made_for({"task": task, **header}, args.model))
     need(task == header.get("task") or not args.record, f"{args.model}: header: task: expected "
          f"{task!r} to record its returns, found {header.get('task')!r}")
     if args.record:

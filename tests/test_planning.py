@@ -397,7 +397,7 @@ def in_a_pool(workers):
     """What a pool's process, a daemonic one, gets of a planner and of an evaluation."""
     model, config, found = random_model(), fac.PlannerConfig(samples=4, iterations=1), []
     for start in (lambda: fac.Planner(model, config, workers=workers).act(np.zeros(8)).shape,
-                  lambda: len(fac.evaluate(model, "reacher-easy", config, 1, 0, workers)["returns"])):
+                  lambda: len(fac.play(model, "reacher-easy", config, [0], workers)[0])):
         try:
             found.append(start())
         except fac.UserError as error:
