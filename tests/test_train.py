@@ -301,8 +301,8 @@ def test_expert_and_student_learn_over_their_own_horizons(horizon, monkeypatch):
     found, seen = training("--distill-horizon", str(horizon), "--distill-grad-clip", "0.5"), []
     found.buffer.add(*episode(np.random.default_rng(0), 1))
     update, perturbed, student = found.learner.update, fac.taught_batch, found.student
-    monkeypatch.setattr(found.learner, "update", lambda obs, actions, reward, rng: (
-        seen.append((len(obs), len(actions), len(reward))), update(obs, actions, reward, rng))[1])
+    monkeypatch.setattr(found.learner, "update", lambda obs, actions, reward, *rest: (
+        seen.append((len(obs), len(actions), len(reward))), update(obs, actions, reward, *rest))[1])
     monkeypatch.setattr(fac, "taught_batch", lambda *args: (
         seen.append(len(args[3])), perturbed(*args))[1])
     step = student.optimizer.step
