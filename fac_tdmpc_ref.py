@@ -1644,9 +1644,9 @@ def task_repeat(task):
 
 
 def task_steps(task, config):
-    """T: decisions in an episode of a task, at most, planned for with a PlannerConfig."""
-    return make_robot(task, config.action_repeat).episode_steps if str(task).startswith(GYM) else (
-        config.episode_steps)
+    """T: decisions in an episode of a task, at most, with the action repeat of a PlannerConfig."""
+    robot = make_robot(task, config.action_repeat) if str(task).startswith(GYM) else config
+    return robot.episode_steps
 
 
 class Environment:
@@ -2012,8 +2012,7 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
 
     workers: processes that share the episodes [one for each core]; 0, or with an `environment`: all
     in this one. An episode depends on its seed, not on their number. noise: as `decisions`'s."""
-    T = (task_steps(task, config) if environment is None else
-         getattr(environment, "episode_steps", config.episode_steps))
+    T = getattr(environment, "episode_steps", None) or task_steps(task, config)
     E, sizes = len(seeds), model.config
     at_once = math.gcd(T, 25)  # decisions of a worker's message: of one episode
     found = [np.zeros((E, T, *shape), F32) for shape in ((sizes.dim_obs,), (sizes.dim_action,))]
@@ -2426,8 +2425,9 @@ def print_table(rows):
 def command_evaluate(args):
     """evaluate: a model's returns on a task."""
     model, header = load_model(args.model)
-    need(task := args.task or header.get("task"), f"{args.model}: header: no task; pass --task")
-    planning = from_args(PlannerConfig, args, **made_for({"task": task, **header}, args.model))
+    task = args.task or header.get("task")
+    planning = from_args(PlannerConfig, args, **made_for({**header, "task": task}, args.model))
+    need(task, f"{args.model}: header: no task; pass --task")
     need(task == header.get("task") or not args.record, f"{args.model}: header: task: expected "
          f"{task!r} to record its returns, found {header.get('task')!r}")
     if args.record:
