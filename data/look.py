@@ -340,6 +340,8 @@ def open_model(args, **kinds):
     """(model, header, task) that --model, of `load_model`'s kinds, and --task name."""
     model, header = fac.load_model(args.model, **kinds)
     fac.need(task := args.task or header.get("task"), f"{args.model}: header: no task; pass --task")
+    fac.need(not str(task).startswith(fac.GYM), f"{task}: expected a task of dm_control, whose "
+             "episodes are equally long, and which draws; distill and evaluate play this one")
     fac.check_task(model.config, task, args.model)
     return model, header, task
 

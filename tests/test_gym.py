@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+import experiments
 import fac_tdmpc_ref as fac
 import import_expert
 import train_expert
@@ -237,6 +238,15 @@ def test_what_is_no_robot_for_this_is_refused_in_one_line(task, parts, tmp_path,
         (line,) = capsys.readouterr().err.splitlines()
         assert task in line and all(part in line for part in parts)
     assert not list(tmp_path.iterdir())
+
+
+def test_what_draws_says_that_it_is_for_others(tmp_path, capsys):
+    model = fac.WorldModel.create(fac.ModelConfig(3, 2, 2, 2, 4, 4), np.random.default_rng(0))
+    fac.save_model(tmp_path / "model.npz", model, {"kind": "student", "task": WALK})
+    for command in ("watch", "figure9", "agreement"):
+        assert experiments.main([command, "--model", str(tmp_path / "model.npz")]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"{WALK}: expected a task of dm_control" in line
 
 
 def test_without_gymnasium_all_else_works_and_the_extra_is_named(tmp_path):
