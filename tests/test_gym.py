@@ -144,6 +144,16 @@ def test_a_learner_s_value_where_the_state_ended_is_the_reward():
     assert abs(value(True) - 1) < 0.1 and value(False) > 5
 
 
+def test_training_tells_the_learner_which_states_ended_an_episode(monkeypatch):
+    args = train_expert.make_parser().parse_args(["--task", WALK, *SMALL, "--steps", "48"])
+    training, seen = train_expert.Training(args, *train_expert.read_settings(args)), []
+    training.buffer.add(np.zeros((4, 3)), np.zeros((3, 2)), np.zeros(3), True)
+    monkeypatch.setattr(training.learner, "update",
+                        lambda *batch: seen.append(batch[-1]) or [0.0] * 3)
+    training.learn()
+    assert seen[0].tolist() == [[1] * 8, [1] * 8, [0] * 8] and seen[0].dtype == np.float32
+
+
 # the buffer ---------------------------------------------------------------------------
 
 

@@ -115,6 +115,9 @@ def test_segments_are_in_order_and_most_get_other_targets():
     moved = ~np.isclose(obs[0, 3], walk[starts, 3])
     assert 0.67 < moved.mean() < 0.83
     assert not reward[:, ~moved].any() and reward[:, moved].any()
+    again = before[0].copy(), before[1].copy()  # of decisions of four steps
+    train_expert.hindsight("reacher-easy", buffer, where, *again, np.random.default_rng(2), 4)
+    assert set(np.unique(reward)) == {0, 2} and set(np.unique(again[1])) == {0, 4}
     # hindsight moves the target by a later finger-to-target of the episode, fresh ones are near 0
     back = walk[starts, 3] - obs[0, 3]
     reached = np.isclose(back[:, None], walk[:, 3], atol=1e-4)
