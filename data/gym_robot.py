@@ -1,6 +1,7 @@
 """Gymnasium's robots: a task gym:ID, such as gym:Pendulum-v1 or gym:Reacher-v5.
 
-    python data/train_expert.py --task gym:Pendulum-v1
+    python data/train_expert.py --task gym:Pendulum-v1 --steps 8000 --seed-decisions 800 \\
+        --std-steps 4000 --latent-dim 16 --enc-dim 64 --mlp-dim 128
     python fac_tdmpc_ref.py distill --task gym:Pendulum-v1 --expert runs/train-gym:Pendulum-v1-0
 
 gym:MODULE:ID imports MODULE first, which registers a robot of your own. fac_tdmpc_ref.make_robot

@@ -33,6 +33,7 @@ TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
 NOT_ONLINE = ("steps", "reuse", "expert_episodes", "held_out")
 FOLLOWING_DEFAULTS = {"expert_episodes": 0}  # the student's own instead, each round
 TORCH_ONLY = {"device": None, "precision": "float32", "threads": 1}  # and their defaults
+DECISIONS = 30_000  # in all, or the next number of whole rounds
 FINGER_RADIUS, REACHER_LINK = 0.01, 0.09  # of data/reacher.xml, metres
 LOSSES = ("consistency", "reward", "value", "kl_reward", "kl_value")
 CURVE = ("decisions", "updates", "seconds", "exploration_std", "horizon", "return_mean",
@@ -577,6 +578,8 @@ def read_settings(args):
                             f"max_std ({planning.min_std}, {planning.max_std}), not "
                             f"{config.std_start}")
     quota = args.envs * fac.task_steps(args.task, planning)
+    if args.steps is None:
+        args.steps = -(-DECISIONS // quota) * quota
     fac.need(args.steps and args.steps % quota == 0, f"--envs {args.envs} needs --steps of whole "
              f"rounds of {quota}, not {args.steps}")
     fac.need(args.student or args.num_agents is None, "--num-agents needs --student")
@@ -700,8 +703,8 @@ def make_parser():
     add, natural = parser.add_argument, fac.natural
     positive = functools.partial(natural, least=1)
     add("--task", default="reacher-easy", help="one of: " + fac.task_names())
-    add("--steps", type=natural, default=30_000, help="decisions in all; a "
-        "run that is over goes on with more [30000]")
+    add("--steps", type=natural, help="decisions in all; a run that is over goes on with more "
+        "[30000, or what makes whole rounds]")
     add("--seed", type=natural, default=0, help="[0]")
     add("--student", choices=("fac",), help="fac: after each update of the expert, one of a "
         "factored student on states of its batch")

@@ -145,8 +145,12 @@ def test_a_learner_s_value_where_the_state_ended_is_the_reward():
 
 
 def test_training_tells_the_learner_which_states_ended_an_episode(monkeypatch):
-    args = train_expert.make_parser().parse_args(["--task", WALK, *SMALL, "--steps", "48"])
+    args = train_expert.make_parser().parse_args(["--task", WALK, *SMALL])
     training, seen = train_expert.Training(args, *train_expert.read_settings(args)), []
+    assert args.steps == 30_000  # 625 rounds of 4 x 12
+    args.task, args.steps = "gym:Pendulum-v1", None
+    train_expert.read_settings(args)
+    assert args.steps == 38 * 4 * 200
     training.buffer.add(np.zeros((4, 3)), np.zeros((3, 2)), np.zeros(3), True)
     monkeypatch.setattr(training.learner, "update",
                         lambda *batch: seen.append(batch[-1]) or [0.0] * 3)
