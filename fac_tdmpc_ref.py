@@ -80,6 +80,7 @@ class ModelConfig(Settings):
     expert_latent_dim: int = field(0, "of the expert's latent, if that is encoded", least=0)
     expert_enc_dim: int = field(256, "hidden width of the expert's encoder", least=1)
     expert_mlp_dim: int = field(0, "of its frozen policy and dynamics [D9]; 0: none", least=0)
+    groups: str = field("", "robot's action dimensions of each agent, 0,2/1,3; '': in order")
 
     @property
     def agent_actions(self):
@@ -807,9 +808,14 @@ def refuse(config, name, rule):
 
 
 def _model_rules(config):
-    agents = divisors(config.dim_action)
+    agents, each = divisors(config.dim_action), map(str, range(config.dim_action))
     yield ("num_agents", config.num_agents in agents,
            f"one of {agents}, as {config.dim_action} action dimensions are shared evenly")
+    groups = [group.split(",") for group in config.groups.split("/")]
+    yield ("groups", not config.groups or len(groups) == config.num_agents and
+           len({len(group) for group in groups}) == 1 and sorted(sum(groups, [])) == sorted(each),
+           "equally many action dimensions for each agent (one array holds all), each of 0 to "
+           f"{config.dim_action - 1} once, as --agents 0,2/1,3")
 
 
 def _planner_rules(config):
@@ -889,11 +895,16 @@ def student_planning(config):
     return STUDENT_PLANNING if config.policy_share else {}
 
 
-def policy_plan(expert, z, steps, agents=1):
-    """What an expert's policy would do from z (1, m, B) on, rolled out in its model: each of so
-    many agents' part, (N, L, d, B)."""
-    actions = policy_rollout(expert, z, [F32(0)] * steps)
-    return actions.reshape(steps, agents, -1, z.shape[2]).swapaxes(0, 1)
+def agent_order(sizes):
+    """An index that takes a robot's action dimensions to the order of a ModelConfig's agents."""
+    return [*map(int, sizes.groups.replace("/", ",").split(","))] if sizes.groups else slice(None)
+
+
+def policy_plan(expert, z, steps, sizes):
+    """What an expert's policy would do from z (1, m, B) on, rolled out in its model: the part of
+    each agent of a ModelConfig, (N, L, d, B)."""
+    actions = policy_rollout(expert, z, [F32(0)] * steps)[:, 0, agent_order(sizes)]
+    return actions.reshape(steps, sizes.num_agents, -1, z.shape[2]).swapaxes(0, 1)
 
 
 def around_policy(expert, obs, actions, share, rng):
@@ -902,11 +913,11 @@ def around_policy(expert, obs, actions, share, rng):
     chosen = rng.random(obs.shape[1]) < share
     if chosen.any():
         z, actions = expert.encode(obs[:, chosen]), actions.copy()
-        actions[:, :, chosen] = policy_plan(expert, z, len(actions))[0]
+        actions[:, :, chosen] = policy_plan(expert, z, len(actions), expert.config)[0]
     return actions
 
 
-def credit(expert, tapes, actions, predicted, agents):
+def credit(expert, tapes, actions, predicted, sizes):
     """Each agent's part of what perturbing actions does to the expert's predictions.
 
     Copy 0 is unperturbed. Along the line from its actions to copy k's a prediction y changes by the
@@ -918,8 +929,8 @@ def credit(expert, tapes, actions, predicted, agents):
     one part of N = 1 teaches what the paper's joint divergence does: a softmax knows no constants.
 
     expert: of one agent; tapes: of `unroll` and `run_heads` for its actions (L, A, B, K), used up;
-    predicted: three (L, B, K). Returns the reward's parts (N, L, B, K) and, for each Q, those of
-    both Q's mean, by which plans are ranked."""
+    predicted: three (L, B, K); sizes: the agents' ModelConfig. Returns the reward's parts
+    (N, L, B, K) and, for each Q, those of both Q's mean, by which plans are ranked."""
     (L, A, B, K), m, params = actions.shape, expert.config.latent_dim, expert.params
     half = np.full((1, 1, L * B * K), 0.5, actions.dtype)
     d_q = sum(backward(QNET, params, name, tapes[name], half, None) for name in ("_Q1", "_Q2"))
@@ -935,9 +946,9 @@ def credit(expert, tapes, actions, predicted, agents):
             d = np.concatenate([d, later.reshape(m + A, 2, L - 1 - j, -1)], 2)
         later, g = d[:m], d[m:].reshape(A, 2, L - j, B, K)
         parts[:, :, j:] += way[j][:, None, None] * (g + g[..., :1]) / 2
-    parts = parts.reshape(agents, -1, 2, L, B, K).sum(1)
+    parts = parts[agent_order(sizes)].reshape(sizes.num_agents, -1, 2, L, B, K).sum(1)
     y = np.stack([predicted[0], (predicted[1] + predicted[2]) / 2])
-    parts += (y - y[..., :1] - parts.sum(0)) / agents
+    parts += (y - y[..., :1] - parts.sum(0)) / sizes.num_agents
     return [parts[:, 0], parts[:, 1], parts[:, 1]]
 
 
@@ -947,14 +958,16 @@ def credited_batch(expert, student, obs, actions, config, rng):
     perturbed, z = perturbed_actions(actions, config, rng), expert.encode(obs)
     perturbed[..., :1] = actions[..., :1]
     predicted = predict(expert, z, perturbed, tapes := defaultdict(list))
-    parts = credit(expert, tapes, perturbed, predicted, student.config.num_agents)
+    parts = credit(expert, tapes, perturbed, predicted, student.config)
     return student.features(obs, z), perturbed, parts
 
 
 def taught_batch(expert, student, obs, actions, config, rng):
-    """`perturbed_batch` or `credited_batch`, by the config's `targets`."""
+    """`perturbed_batch` or `credited_batch`, by the config's `targets`, whose actions (L, A, B, K)
+    are in the order of the student's agents."""
     batch = credited_batch if config.targets == "credit" else perturbed_batch
-    return batch(expert, student, obs, actions, config, rng)
+    features, perturbed, targets = batch(expert, student, obs, actions, config, rng)
+    return features, perturbed[:, agent_order(student.config)], targets
 
 
 def teacher_of(model, config):
@@ -1019,7 +1032,8 @@ class Distiller:
 
     The expert is frozen: what it predicts for a pool of states and their perturbed actions is
     computed once and learned from `reuse` times; by two threads: NumPy's products hold no GIL.
-    sizes: replace `student_config`'s. UserError if expert, replay and config don't fit."""
+    num_agents: N, or `groups`; sizes: replace `student_config`'s. UserError if expert, replay and
+    config don't fit."""
 
     loss, perturb = staticmethod(distill_loss), staticmethod(taught_batch)  # or a subclass's own
 
@@ -1041,6 +1055,8 @@ class Distiller:
         self.played = np.zeros((0, replay.dim_obs + replay.dim_action), np.float16)
         self.lengths = np.zeros(0, np.int64)
         agents = theirs.dim_action if num_agents is None else num_agents
+        if isinstance(agents, str):
+            sizes["groups"], agents = agents or ",", agents.count("/") + 1
         needed = config.steps * config.batch_size // config.reuse
         self.pool_size = max(config.batch_size, min(POOL, needed))
         sizes = dataclasses.replace(student_config(theirs, agents, config.encoder_input,
@@ -1161,6 +1177,8 @@ class PlainDistiller(Distiller):
         need((config.targets, config.policy_share, config.expert_episodes, config.reuse) ==
              ("joint", 0, 0, 1), "--plain is Algorithm 1 alone: without --targets, "
              "--policy-share, --expert-episodes and --reuse")
+        need(not isinstance(num_agents, str), "--plain cuts actions in their order; pass "
+             "--num-agents for --agents")
         super().__init__(expert, replay, config, num_agents, seed)
 
     def load(self, state):
@@ -1380,7 +1398,7 @@ def some_agents(model, i, j):
     sizes = model.config
     if j - i == sizes.num_agents:
         return model
-    config = dataclasses.replace(sizes, num_agents=j - i, expert_latent_dim=0,
+    config = dataclasses.replace(sizes, num_agents=j - i, groups="", expert_latent_dim=0,
                                  dim_action=(j - i) * sizes.agent_actions)
     return WorldModel(config, {k: np.ascontiguousarray(v[i:j]) for k, v in model.params.items()
                                if k.startswith(("_dynamics", "_reward", "_Q"))})
@@ -1461,14 +1479,16 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
             except BaseException:  # answers left unread would be the next decision's
                 self.close()
                 raise
-        return np.concatenate(plans).reshape(-1)
+        action = np.empty(self.model.config.dim_action, F32)
+        action[agent_order(self.model.config)] = np.concatenate(plans).reshape(-1)
+        return action
 
     def _prior(self, obs):
         """The expert's policy from obs (O,) on, rolled out in its model: (N, L, d), or None."""
         if self.config.prior == "none":
             return None
         return policy_plan(self._teacher, self._teacher.encode(obs[:, None]),
-                           self.config.horizon + 1, self.model.config.num_agents)[..., 0]
+                           self.config.horizon + 1, self.model.config)[..., 0]
 
 
 def _planning_worker(connection):
@@ -1496,6 +1516,8 @@ class Workers(contextlib.AbstractContextManager):
 
     def __init__(self, target, count, name="worker"):
         context, self._name, self._members = multiprocessing.get_context("spawn"), name, []
+        need(not count or not multiprocessing.current_process().daemon, "daemonic processes, as a "
+             "multiprocessing.Pool's, can't start workers: pass workers=0")
         if getattr(main := sys.modules["__main__"], "__file__", "") == "<stdin>":
             del main.__file__  # or children look for it
         for _ in range(count):
@@ -1598,6 +1620,35 @@ def import_dm_control(render=False):
     return suite, control, reacher
 
 
+GYM = "gym:"  # before a task's ID in Gymnasium
+
+
+def make_robot(task, action_repeat=None):
+    """The robot of a task: dm_control's, an `Environment`, or data/gym_robot.py's of gym:ID."""
+    repeat = task_repeat(task) if action_repeat is None else action_repeat
+    if not str(task).startswith(GYM):
+        return Environment(task, repeat)
+    if str(DATA) not in sys.path:
+        sys.path.append(str(DATA))
+    with optional("gymnasium, and a clone of the repository", "gym"):
+        from gym_robot import GymRobot
+    try:
+        return GymRobot(task[len(GYM):], repeat)
+    except ValueError as error:
+        raise UserError(f"{task}: {error}") from None
+
+
+def task_repeat(task):
+    """A task's control steps a decision, where a file or a setting names no others."""
+    return 1 if str(task).startswith(GYM) else ACTION_REPEAT
+
+
+def task_steps(task, config):
+    """T: decisions in an episode of a task, at most, with the action repeat of a PlannerConfig."""
+    robot = make_robot(task, config.action_repeat) if str(task).startswith(GYM) else config
+    return robot.episode_steps
+
+
 class Environment:
     """One of the paper's 11 tasks, or another one of dm_control's suite.
 
@@ -1609,6 +1660,8 @@ class Environment:
     def __init__(self, task, action_repeat=ACTION_REPEAT, render=False):
         self.action_repeat, self.episode_steps = action_repeat, episode_steps(action_repeat)
         domain, name, self.dim_obs, self.dim_action = lookup_task(task)
+        need(not str(task).startswith(GYM), f"{task}: distill, evaluate and train_expert.py play "
+             "Gymnasium's; expected one of dm_control's here")
         suite, control, reacher = import_dm_control(render)
         if domain == "reacher":
             need(REACHER.exists(), f"{REACHER}: no such file; run from a clone of the repository")
@@ -1641,27 +1694,33 @@ class Environment:
 
 
 def robot_step(robot, action, sizes, t):
-    """Decision t of an episode: next observation (O,), reward, whether it is over. What goes to and
-    fro is copied. A robot's third value, if any, tells the end, or dm_control's reward of None: the
-    next episode has begun, and all of this is none of ours. UserError: what isn't finite."""
-    obs, reward, *over = robot.step(np.array(action))
-    need(len(over) < 2, f"decision {t}: expected (observation, reward), or a third, the end")
+    """Decision t of an episode: next observation (O,), reward, whether it is over, and whether by
+    its state, beyond which nothing is worth anything: a robot's third value, if any; a fourth tells
+    that the time is over. dm_control's reward of None: the next episode has begun, and all of this
+    is none of ours. What goes to and fro is copied. UserError: what isn't finite."""
+    obs, reward, *ends = robot.step(np.array(action))
+    need(len(ends) < 3, f"decision {t}: expected (observation, reward), or also whether the state "
+         "ended the episode, and whether the time did")
     if reward is None and t:
-        return None, None, True
+        return None, None, True, False
     reward = np.asarray(reward, float)  # None is NaN
     need(reward.size == 1 and np.isfinite(reward).all(), f"decision {t}: expected a finite reward, "
          f"found {reward}")
-    return observed(obs, sizes, f"decision {t}: observation"), reward.item(), any(over)
+    obs = observed(obs, sizes, f"decision {t}: observation")
+    return obs, reward.item(), any(ends), any(ends[:1])
 
 
 def task_names():
     """What a task may be, for --help and errors."""
-    return f"{', '.join(TASKS)}, or another DOMAIN-TASK of dm_control's suite"
+    return f"{', '.join(TASKS)}, another DOMAIN-TASK of dm_control's suite, or gym:ID of Gymnasium"
 
 
 def lookup_task(task):
     """(domain, name, dim O, dim A) of a task; UserError with the nearest name otherwise."""
     task = str(task)
+    if task.startswith(GYM):
+        robot = make_robot(task)
+        return *task.split(":", 1), robot.dim_obs, robot.dim_action
     return *task.split("-", 1), *(TASKS[task] if task in TASKS else suite_sizes(task))
 
 
@@ -1825,8 +1884,8 @@ def made_for(header, where):
         settings = {name: settings[name] for name in names if name in settings}
         from_dict(PlannerConfig, settings, f"{there}: {group}")
         found.update(settings)
-    if "action_repeat" in header:
-        found["action_repeat"] = header["action_repeat"]
+    if "action_repeat" in header or str(header.get("task")).startswith(GYM):
+        found["action_repeat"] = header.get("action_repeat", 1)
     from_dict(PlannerConfig, found, there)
     return found
 
@@ -1917,7 +1976,7 @@ def decisions(model, task, config, seeds, environment=None, noise=0.0):
     (A,), reward and seconds of planning; past its end up to T NaN, reward 0. environment: instead
     of the task's, see `robot_step`; with T as `episode_steps` if it has that. noise: each episode
     draws the deviation of what is added to its actions, evenly from 0 to this."""
-    environment = Environment(task, config.action_repeat) if environment is None else environment
+    environment = make_robot(task, config.action_repeat) if environment is None else environment
     planner, sizes = Planner(model, config), model.config
     past = np.full(sizes.dim_obs, np.nan), np.full(sizes.dim_action, np.nan), 0.0, np.nan
     for seed in seeds:
@@ -1934,7 +1993,7 @@ def decisions(model, task, config, seeds, environment=None, noise=0.0):
             if noise:
                 action = action + deviation * rng.standard_normal(action.shape, F32)
                 action = np.clip(action, -1, 1)
-            before, (obs, reward, over) = obs, robot_step(environment, action, sizes, t)
+            before, (obs, reward, over, _) = obs, robot_step(environment, action, sizes, t)
             yield past if obs is None else (before, action, reward, seconds)
 
 
@@ -1953,7 +2012,7 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
 
     workers: processes that share the episodes [one for each core]; 0, or with an `environment`: all
     in this one. An episode depends on its seed, not on their number. noise: as `decisions`'s."""
-    T = getattr(environment, "episode_steps", config.episode_steps)
+    T = getattr(environment, "episode_steps", None) or task_steps(task, config)
     E, sizes = len(seeds), model.config
     at_once = math.gcd(T, 25)  # decisions of a worker's message: of one episode
     found = [np.zeros((E, T, *shape), F32) for shape in ((sizes.dim_obs,), (sizes.dim_action,))]
@@ -1986,7 +2045,7 @@ def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="eval
     check_task(model.config, task)
     *_, rewards, seconds = play(model, task, config, episode_seeds(seed, episodes), workers, label)
     return {"returns": rewards.sum(1).tolist(),
-            "plan_ms_median": 1e3 * float(np.median(seconds.mean(1)))}
+            "plan_ms_median": 1e3 * float(np.median(np.nanmean(seconds, 1)))}
 
 
 def check_task(sizes, task, what="the model"):
@@ -2240,7 +2299,7 @@ def load_data(args):
     need(header.get("task") == args.task, f"{path}: header: task: expected {args.task!r}, found "
          f"{header.get('task')!r}")
     check_task(expert.config, args.task)
-    Environment(args.task)  # what is missing is missed now, not after the last step
+    make_robot(args.task)  # what is missing is missed now, not after the last step
     replay = Replay(args.replay or path.with_name("replay.npz"))
     repeat = made_for(header, path).get("action_repeat", ACTION_REPEAT)
     found = made_for(replay.header, replay.path).get("action_repeat", repeat)
@@ -2252,7 +2311,9 @@ def load_data(args):
 def distil_and_save(distiller, args, planning, header, out):
     """Algorithm 1 to its end; writes student, curve and configuration. Returns result's part."""
     student, config, replay = distiller.student, distiller.config, distiller.replay
-    settings = {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
+    sizes = student.config
+    settings = {"task": args.task, "seed": args.seed,
+                "num_agents": sizes.groups or sizes.num_agents,
                 "distill": asdict(config), "data": data_checksums(distiller.expert, replay),
                 "action_repeat": planning.action_repeat}
     if (path := out / "student.npz").exists():  # a run that this one would replace
@@ -2364,8 +2425,9 @@ def print_table(rows):
 def command_evaluate(args):
     """evaluate: a model's returns on a task."""
     model, header = load_model(args.model)
-    planning = from_args(PlannerConfig, args, **made_for(header, args.model))
-    need(task := args.task or header.get("task"), f"{args.model}: header: no task; pass --task")
+    task = args.task or header.get("task")
+    planning = from_args(PlannerConfig, args, **made_for({**header, "task": task}, args.model))
+    need(task, f"{args.model}: header: no task; pass --task")
     need(task == header.get("task") or not args.record, f"{args.model}: header: task: expected "
          f"{task!r} to record its returns, found {header.get('task')!r}")
     if args.record:
@@ -2450,7 +2512,9 @@ def make_parser():
     add = sub.add_argument
     add("--task", default="reacher-hard", help="one of: " + task_names())
     add("--seed", type=natural, default=0, help="of distillation [0]")
-    add("--num-agents", type=int, help="N, a divisor of dim(A) [dim(A)]")
+    agents = sub.add_mutually_exclusive_group().add_argument
+    agents("--num-agents", type=int, help="N, a divisor of dim(A) [dim(A)]")
+    agents("--agents", dest="num_agents", help="action dimensions of each, equally many: 0,2/1,3")
     add("--preset", choices=("default", "plain", "paper"), default="default", help="paper: the "
         "paper's value of every setting that names one below (days on a laptop); plain: the "
         "paper's method at this project's budget, without what it adds [D8] [D9]")

@@ -34,7 +34,7 @@ import numpy as np
 sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
 import fac_tdmpc_ref as fac  # noqa: E402
 from fac_tdmpc_ref import need  # noqa: E402
-from train_expert import Episode, ReplayBuffer  # noqa: E402
+from train_expert import ReplayBuffer  # noqa: E402
 
 MAX_BYTES = 1 << 29  # of a file, unpacked; a checkpoint with Table 2's sizes has 13 MB
 MAX_RATIO = 50  # unpacked bytes for each packed one, beyond the first MAX_PIECE
@@ -484,22 +484,18 @@ def from_d4rl(found):
 
 
 def collect(path, environment, episodes, seed):
-    """A buffer of episodes that a file's model plays, each with noise of another deviation."""
+    """(buffer, returns) of episodes that a file's model plays, each with noise of another
+    deviation; what the last decision of one led to isn't known."""
     model, header = fac.load_model(path)
     config = fac.PlannerConfig(**fac.made_for(header, path))
-    steps = config.episode_steps
-    buffer = ReplayBuffer(*fac.lookup_task(header["task"])[2:], episodes * steps, steps=steps)
-    with fac.Planner(model, config) as planner, \
-            fac.progress("collecting", episodes * steps, "decision") as bar:
-        for i in range(episodes):
-            rng = np.random.default_rng([seed, i])
-            std, start = rng.uniform(0, MAX_NOISE), int(rng.integers(2 ** 31))
-            episode = Episode(environment, start, exploration_std=std)
-            for _ in range(steps):
-                episode.play(planner, 1)
-                bar.update()
-            buffer.add(*episode.arrays())
-    return buffer
+    seeds = fac.training_seeds(seed, "collected episode", 0, episodes)
+    obs, action, reward, _ = fac.play(model, None, config, seeds, 0, "collecting", environment,
+                                      MAX_NOISE)
+    steps = obs.shape[1]
+    buffer = ReplayBuffer(*obs.shape[2:], action.shape[2], episodes * steps, steps=steps)
+    for e, n in enumerate(np.isfinite(obs[..., 0]).sum(1)):
+        buffer.add(obs[e, :n], action[e, :n - 1], reward[e, :n - 1])
+    return buffer, reward.sum(1).tolist()
 
 
 # ---------------------------------------------------------------------------- command line
@@ -509,8 +505,10 @@ def run(args):
     need(args.collect is None or args.collect > 1, f"--collect must be at least 2, better "
          f"{LEAST_EPISODES}: distill holds out an episode in {LEAST_EPISODES}; not {args.collect}")
     fac.lookup_task(args.task)
+    if args.action_repeat is None:
+        args.action_repeat = fac.task_repeat(args.task)
     fac.PlannerConfig(action_repeat=args.action_repeat)  # refuses what is none
-    environment = args.collect and fac.Environment(args.task, args.action_repeat)  # or misses it
+    environment = args.collect and fac.make_robot(args.task, args.action_repeat)  # or misses it
     sizes, weights, kinds = find_expert(args.file, args.task)
     arrays = args.replay and find_replay(args.replay, sizes)
     about = {"task": args.task, "imported_from": Path(args.file).name,
@@ -535,7 +533,7 @@ def run(args):
         if environment:
             with tempfile.TemporaryDirectory() as scratch:  # an expert is replaced with its replay
                 fac.write_npz(path := Path(scratch) / "expert.npz", header, weights)
-                buffer = collect(path, environment, args.collect, args.seed)
+                buffer, returns = collect(path, environment, args.collect, args.seed)
         fac.write_npz(out / "expert.npz", header, weights)
         result = {**about, "file": args.file, "out": args.out, "stored_as": kinds, "episodes": 0,
                   "weights": sum(w.size for w in weights.values()), "model": vars(sizes),
@@ -544,7 +542,7 @@ def run(args):
             fac.write_npz(out / "replay.npz", {"kind": "replay", **about}, arrays, compress=True)
         elif environment:
             buffer.write(out / "replay.npz", about)
-            result["returns"] = [float(r) for r in buffer.reward.sum(1)]
+            result["returns"] = returns
         if arrays or environment:
             replay = fac.Replay(out / "replay.npz")
             result.update(episodes=len(replay.ends), transitions=replay.transitions)
@@ -576,8 +574,8 @@ def main(argv=None):
     parser.add_argument("file", metavar="FILE", help="checkpoint: " + ", ".join(CHECKPOINTS))
     parser.add_argument("--task", required=True, help="one of: " + fac.task_names())
     parser.add_argument("--out", required=True, help="folder for expert.npz and replay.npz")
-    parser.add_argument("--action-repeat", type=fac.natural, default=fac.ACTION_REPEAT, metavar="N",
-                        help="control steps of the expert's decisions [%(default)s]")
+    parser.add_argument("--action-repeat", type=fac.natural, metavar="N",
+                        help=f"control steps of its decisions [{fac.ACTION_REPEAT}; gym:ID 1]")
     data = parser.add_mutually_exclusive_group()
     data.add_argument("--replay", help="an .npz or HDF5 with observation, action and continues "
                       "(README), or observations, actions, terminals, timeouts (D4RL)")

@@ -163,6 +163,7 @@ def credit(model, obs, actions, config):
 
     obs (T, O), actions (T, A): Equation 2 for the actions that were executed."""
     n, d = model.config.num_agents, model.config.agent_actions
+    actions = actions[:, fac.agent_order(model.config)]
     z, H = model.encode(np.ascontiguousarray(obs.T)), config.horizon
     shares = [fac.h_step_return(model, z[:, :, t:t + 1],
                                 actions[t:t + H + 1].reshape(H + 1, n, d).swapaxes(0, 1)[..., None],
@@ -258,15 +259,16 @@ def plan_gains(expert, model, config, obs, seed=0):
     two (S,)."""
     with fac.one_thread():
         z, own, planner = expert.encode(obs), model.encode(obs), fac.FastPlanner(model, config)
-        policy, plans = fac.policy_plan(expert, z, config.horizon + 1, len(own)), []
+        policy, plans = fac.policy_plan(expert, z, config.horizon + 1, model.config), []
         first = policy * fac.F32(config.prior == "policy")
         for i, seeds in enumerate(fac.seed_sequence(seed).spawn(obs.shape[1])):
             planner.reset(seeds.spawn(len(own)))
             plans.append(planner.search(own[:, :, i:i + 1], first[..., i])[0])
         both = np.stack([np.stack(plans, -1), policy], -1).swapaxes(0, 1)  # (L, N, d, S, 2)
         both = both.reshape(len(both), -1, *both.shape[3:])
-        G = [fac.horizon_returns(*fac.predict(*of, both), config.discount)[-1]
-             for of in ((expert, z), (model, own))]
+        robot = np.argsort(np.arange(both.shape[1])[fac.agent_order(model.config)])
+        G = [fac.horizon_returns(*fac.predict(*of), config.discount)[-1]
+             for of in ((expert, z, both[:, robot]), (model, own, both))]
     return [g[:, 0] - g[:, 1] for g in G]
 
 
@@ -298,11 +300,12 @@ def agreement(student, expert, obs, actions, rng, values=32):
     dimension takes other values: (A, B) of states obs (O, B), around actions (A, B)."""
     z, z_expert, dim_action = student.encode(obs), expert.encode(obs), len(actions)
     n, d, batch = student.config.num_agents, student.config.agent_actions, obs.shape[1]
-    found = []
+    order = np.arange(dim_action)[fac.agent_order(student.config)]
+    owners, found = np.argsort(order) // d, []
     for j in range(dim_action):
         a = np.repeat(actions, values, 1)
         a[j] = rng.uniform(-1, 1, batch * values)
-        own = sum(student.q(np.repeat(z, values, 2), a.reshape(n, d, -1)))[j // d]
+        own = sum(student.q(np.repeat(z, values, 2), a[order].reshape(n, d, -1)))[owners[j]]
         theirs = sum(expert.q(np.repeat(z_expert, values, 2), a[None]))[0]
         found.append(fac.spearman(*(q.reshape(batch, values) for q in (own, theirs))))
     return np.stack(found)
@@ -367,6 +370,8 @@ def open_model(args, **kinds):
     """(model, header, task) that --model, of `load_model`'s kinds, and --task name."""
     model, header = fac.load_model(args.model, **kinds)
     fac.need(task := args.task or header.get("task"), f"{args.model}: header: no task; pass --task")
+    fac.need(not str(task).startswith(fac.GYM), f"{task}: expected a task of dm_control, whose "
+             "episodes are equally long, and which draws; distill and evaluate play this one")
     fac.check_task(model.config, task, args.model)
     return model, header, task
 

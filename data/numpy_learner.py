@@ -43,7 +43,8 @@ def td_targets(model, target, obs, reward, noise, discount):
     """What TD-MPC's code holds fixed: latents of the moving-average encoder, and TD targets.
 
     obs (H, O, B): the observation after each action; reward (H, B); noise (A, H * B): the
-    policy's. Returns (1, m, H * B), columns ordered (H, B), and the targets
+    policy's; discount: gamma, or (H, B), 0 where that observation ended the episode. Returns
+    (1, m, H * B), columns ordered (H, B), and the targets
     r_h + gamma min(Q1, Q2)(s_{h+1}, pi(s_{h+1})) (H, B) with the moving averages of Q."""
     after = np.ascontiguousarray(obs.swapaxes(0, 1)).reshape(obs.shape[1], -1)
     z = model.encode(after)
@@ -140,14 +141,16 @@ class Learner:
         self.slow_vector, slow = fac.flatten(self.optimizer.params)
         self.target = fac.WorldModel(sizes, slow)
 
-    def update(self, obs, actions, reward, rng):
+    def update(self, obs, actions, reward, rng, continues=1.0):
         """One step of Equation 1, one of the policy; every `target_every` times the averages.
 
-        obs (H + 1, O, B), actions (H, A, B), reward (H, B). Returns the terms of Equation 1."""
+        obs (H + 1, O, B), actions (H, A, B), reward (H, B); continues (H, B): 0 where the next
+        state ended the episode, whose value is zero, else 1. Returns the terms of Equation 1."""
         config, (steps, dim_action, batch) = self.config, actions.shape
         noise = fac.policy_noise((dim_action, 2 * steps + 1, batch), rng)
         latents, td = td_targets(self.model, self.target, obs[1:], reward,
-                                 noise[:, :steps].reshape(dim_action, -1), config.discount)
+                                 noise[:, :steps].reshape(dim_action, -1),
+                                 config.discount * continues)
         _, terms, rollout = equation_1(self.model, obs[0], actions, reward, latents, td, config,
                                        self.optimizer.grads)
         self.optimizer.step(config.lr, config.grad_clip)

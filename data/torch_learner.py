@@ -70,8 +70,9 @@ def policy(params, z, noise=0.0):
     return a - a.detach() + a.detach().clamp(-1, 1)
 
 
-def equation_1(params, target, obs, action, reward, config, noise=0.0):
-    """Equation 1 on obs (H+1, B, O), action (H, B, A), reward (H, B): loss, its three terms.
+def equation_1(params, target, obs, action, reward, config, noise=0.0, continues=1.0):
+    """Equation 1 on obs (H+1, B, O), action (H, B, A), reward and continues (H, B) (the latter 0
+    where the next state ended the episode): loss, its three terms.
 
     As numpy_learner's: means over features and batch, weighted by lambda^h; what it holds fixed
     comes from the parameters `target` and the policy with noise (1, H * B, A). Returns also the
@@ -82,7 +83,7 @@ def equation_1(params, target, obs, action, reward, config, noise=0.0):
     with torch.no_grad():
         s_next, z_next = (network(fac.ENCODER, p, "_encoder", after) for p in (target, params))
         q = least_q(target, z_next, policy(params, z_next, noise))
-        td = reward + config.discount * q.view(steps, batch)
+        td = reward + continues * (config.discount * q.view(steps, batch))
     latents, terms = [network(fac.ENCODER, params, "_encoder", obs[:1])], [0.0, 0.0, 0.0]
     for h in range(steps):
         x = torch.cat([latents[-1], action[h:h + 1]], -1)
@@ -125,10 +126,11 @@ class TorchLearner:
             self._model.params[key][:] = value.detach().cpu().numpy()
         return self._model
 
-    def update(self, obs, actions, reward, rng):
+    def update(self, obs, actions, reward, rng, continues=1.0):
         """One step of Equation 1, one of the policy; every `target_every` times the averages.
 
-        obs (H + 1, O, B), actions (H, A, B), reward (H, B), arrays. Returns the three terms.
+        obs (H + 1, O, B), actions (H, A, B), reward (H, B), arrays, and continues, as
+        numpy_learner's. Returns the three terms.
         """
         config, (steps, dim_action, batch) = self.config, actions.shape
         noise = fac.policy_noise((dim_action, 2 * steps + 1, batch), rng)
@@ -137,7 +139,7 @@ class TorchLearner:
         with self._autocast():
             loss, terms, latents = equation_1(self.params, self.target, obs, actions,
                                               self._tensor(reward), config,
-                                              noise[:, :steps * batch])
+                                              noise[:, :steps * batch], self._tensor(continues))
         self._step(self._optimizer, loss)
         latents = latents.detach()
         with self._autocast():

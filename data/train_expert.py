@@ -33,6 +33,7 @@ TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
 NOT_ONLINE = ("steps", "reuse", "expert_episodes", "held_out")
 FOLLOWING_DEFAULTS = {"expert_episodes": 0}  # the student's own instead, each round
 TORCH_ONLY = {"device": None, "precision": "float32", "threads": 1}  # and their defaults
+DECISIONS = 30_000  # in all, or the next number of whole rounds
 FINGER_RADIUS, REACHER_LINK = 0.01, 0.09  # of data/reacher.xml, metres
 LOSSES = ("consistency", "reward", "value", "kl_reward", "kl_value")
 CURVE = ("decisions", "updates", "seconds", "exploration_std", "horizon", "return_mean",
@@ -45,75 +46,91 @@ class Episode:
     """An episode that is played in parts, so that each can plan with newer weights.
 
     `observation` (T + 1, O), `action` (T, A) and `reward` (T,) grow as lists. They depend on the
-    seed and on the planners that `player`, a name, stood for.
+    seed and on the planners that `player`, a name, stood for. exploration_std: None in a test.
     """
 
-    def __init__(self, environment, seed, player=None, exploration_std=0.0):
+    def __init__(self, environment, seed, player=None, exploration_std=None):
         self.environment, self.seed, self.player = environment, seed, player
         self.exploration_std, self.rng = exploration_std, fac.stream(seed, "exploration")
         self.observation = [fac.observed(environment.reset(seed), environment)]
-        self.action, self.reward = [], []
+        self.action, self.reward, self.over, self.terminated = [], [], False, False
         self._warm_start = None
 
     def play(self, planner, decisions):
-        """Go on with a planner, whose actions get exploration noise, or with None: at random."""
+        """Go on with a planner, whose actions get exploration noise, or with None: at random.
+        Returns how many of the decisions were left when the episode was over."""
         if planner and self._warm_start:
             planner.own.mean, planner.own.rngs = self._warm_start
         elif planner:
             planner.reset(self.seed)
-        for _ in range(decisions):
-            self.action.append(self._explore(planner))
-            obs, reward, over = fac.robot_step(self.environment, self.action[-1], self.environment,
-                                               len(self.reward))
-            fac.need(not over, f"decision {len(self.reward)}: the episode is over; to learn from, "
-                     "all must be equally long")
-            self.observation.append(obs)
-            self.reward.append(reward)
+        while decisions and not self.over:
+            action, decisions = self._explore(planner), decisions - 1
+            obs, reward, self.over, self.terminated = fac.robot_step(
+                self.environment, action, self.environment, len(self.reward))
+            if obs is not None:
+                self.observation.append(obs)
+                self.action.append(action)
+                self.reward.append(reward)
         own = planner and planner.own
         self._warm_start = own and (own.mean, own.rngs)
+        return decisions
+
+    def next(self):
+        """The one that begins after it, unless it is a test."""
+        seed = int(fac.stream(self.seed, "next episode").integers(2 ** 31))
+        return Episode(self.environment, seed, self.player, self.exploration_std)
 
     def _explore(self, planner):
         if planner is None:
             return self.rng.uniform(-1, 1, self.environment.dim_action).astype(np.float32)
         action = planner.act(self.observation[-1])
-        deviation = self.exploration_std  # in TD-MPC's code: MPPI's last one, at least this
+        deviation = self.exploration_std or 0.0  # in TD-MPC's code: MPPI's last one, at least this
         noise = deviation * self.rng.standard_normal(action.shape, np.float32)
         return np.clip(action + noise, -1, 1)
 
     def arrays(self):
-        """Observations, actions and rewards so far, as ReplayBuffer.add takes them."""
-        return np.stack(self.observation), np.stack(self.action), np.array(self.reward, np.float32)
+        """Observations, actions, rewards and end so far, as ReplayBuffer.add takes them."""
+        return (np.stack(self.observation), np.stack(self.action),
+                np.array(self.reward, np.float32), self.terminated)
+
+
+def play_on(episodes, planner, decisions):
+    """Go on with the last of a robot's episodes, and, once it is over, with others, for so many
+    decisions in all; a test is a single one."""
+    while (decisions := episodes[-1].play(planner, decisions)) and (
+            episodes[-1].exploration_std is not None):
+        episodes.append(episodes[-1].next())
 
 
 def _acting_worker(connection):
     """Plays its share of the episodes that `Actors` begin; players without a planner: at random."""
-    task, environments = connection.recv(), []
+    robot, environments = connection.recv(), []
     while True:
         command, *values = connection.recv()
         if command == "begin":
             begun, planners = *values, {}
-            environments += [fac.Environment(task) for _ in begun[len(environments):]]
-            episodes = [Episode(e, *about) for e, about in zip(environments, begun)]
+            environments += [fac.make_robot(*robot) for _ in begun[len(environments):]]
+            played = [[Episode(e, *about)] for e, about in zip(environments, begun)]
         elif command == "play":
             decisions, newer = values
             planners.update({name: fac.Planner(*planning) for name, planning in newer.items()})
-            for episode in episodes:
-                episode.play(planners.get(episode.player), decisions)
+            for episodes in played:
+                play_on(episodes, planners.get(episodes[-1].player), decisions)
             connection.send("played")
         else:
-            connection.send([episode.arrays() for episode in episodes])
+            connection.send([[e.arrays() for e in episodes] for episodes in played])
 
 
 class Actors:
     """Processes that play episodes, part by part, while this one learns."""
 
-    def __init__(self, task, workers):
+    def __init__(self, task, workers, action_repeat=None):
         fac.lookup_task(task)
         self._workers, self._count = fac.Workers(_acting_worker, workers, "acting worker"), workers
-        self._workers.send_all([task] * workers)
+        self._workers.send_all([(task, action_repeat)] * workers)
 
     def begin(self, episodes):
-        """Start episodes: (seed, player, exploration_std) of each."""
+        """Start episodes: (seed, player, exploration_std) of each, or of a test (seed, player)."""
         self._begun = len(episodes)
         self._workers.send_all(("begin", episodes[i::self._count]) for i in range(self._count))
 
@@ -126,7 +143,8 @@ class Actors:
         self._workers.receive_all()
 
     def episodes(self):
-        """(observations, actions, rewards) of every episode so far."""
+        """For each that was begun a list: of it and of those that followed it so far, what
+        `ReplayBuffer.add` takes."""
         self._workers.send_all([("give",)] * self._count)
         played = self._workers.receive_all()
         return [played[i % self._count][i // self._count] for i in range(self._begun)]
@@ -139,75 +157,101 @@ class Actors:
 # ------------------------------------------------------------------------------- learning
 
 class ReplayBuffer:
-    """Whole episodes in fixed memory, to learn from; the oldest go when it is full.
+    """Episodes in fixed memory, to learn from; the oldest go when it is full.
 
-    observation (E, T + 1, O), action (E, T, A), reward (E, T), T = steps; capacity in transitions;
-    `count` episodes have been added so far.
+    Rows, observation (M, O), action (M, A), reward (M,): an episode's decisions, and one row more
+    for what the last led to. Of the episodes held, oldest first: the row that each `begins` with,
+    its decisions, `lengths`, and whether its last state `terminated` it. capacity in transitions,
+    steps: of the longest episode; `count` episodes have been added so far.
     """
 
     def __init__(self, dim_obs, dim_action, capacity, dtype=np.float32, steps=fac.EPISODE_STEPS):
-        episodes, self.count, self.steps = max(1, capacity // steps), 0, steps
-        self.observation = np.zeros((episodes, steps + 1, dim_obs), dtype)
-        self.action = np.zeros((episodes, steps, dim_action), dtype)
-        self.reward = np.zeros((episodes, steps), np.float32)
+        rows, self.count, self.end = max(1, capacity // steps) * (steps + 1), 0, 0
+        self.observation = np.zeros((rows, dim_obs), dtype)
+        self.action = np.zeros((rows, dim_action), dtype)
+        self.reward = np.zeros(rows, np.float32)
+        self.begins, self.lengths = np.zeros((2, 0), np.int64)
+        self.terminated = np.zeros(0, bool)
 
     def __len__(self):
         """Episodes held."""
-        return min(self.count, len(self.reward))
+        return len(self.lengths)
 
-    def add(self, observation, action, reward):
-        """Add an episode: (T + 1, O), (T, A), (T,)."""
-        i = self.count % len(self.reward)
-        self.observation[i], self.action[i], self.reward[i] = observation, action, reward
-        self.count += 1
+    def add(self, observation, action, reward, terminated=False):
+        """Add an episode: (T + 1, O), (T, A), (T,), and whether its last state ended it."""
+        before, n = self.end, len(reward)
+        begin = before if before + n < len(self.reward) else 0
+        self.end, self.count = begin + n + 1, self.count + 1
+        held = (self.begins + self.lengths < begin) | (self.begins >= self.end)
+        if begin < before:  # what is behind the newest is older than what comes first
+            held &= self.begins < before
+        self.begins, self.lengths, self.terminated = (
+            np.append(values[held], value) for values, value in (
+                (self.begins, begin), (self.lengths, n), (self.terminated, bool(terminated))))
+        self.observation[begin:self.end] = observation
+        self.action[begin:self.end - 1], self.action[self.end - 1] = action, 0
+        self.reward[begin:self.end - 1], self.reward[self.end - 1] = reward, 0
 
     def state(self):
-        """The episodes held, as arrays; `load` takes them back."""
-        n = len(self)
-        return {"observation": self.observation[:n], "action": self.action[:n],
-                "reward": self.reward[:n], "count": np.int64(self.count)}
+        """What it holds, as arrays; `load` takes them back."""
+        rows = max(self.begins + self.lengths + 1, default=0)
+        found = {key: np.asarray(getattr(self, key)) for key in (
+            "begins", "lengths", "terminated", "end", "count")}
+        return {**found, **{key: getattr(self, key)[:rows] for key in (
+            "observation", "action", "reward")}}
 
     def load(self, state):
         """Hold what a `state` holds."""
-        n, self.count = len(state["reward"]), int(state["count"])
-        self.observation[:n], self.action[:n], self.reward[:n] = (
-            state[k] for k in ("observation", "action", "reward"))
+        for key in ("observation", "action", "reward"):
+            getattr(self, key)[:len(state[key])] = state[key]
+        self.begins, self.lengths = state["begins"], state["lengths"]
+        self.terminated, self.end = state["terminated"], int(state["end"])
+        self.count = int(state["count"])
 
     def sample(self, rng, batch, steps):
         """Segments drawn evenly, float32: observations (H + 1, O, B), actions (H, A, B), rewards
         (H, B), and where they begin: episodes and steps, (B,) each."""
-        episode = rng.integers(len(self), size=batch)
-        start = rng.integers(self.steps - steps + 1, size=batch)
-        rows = start + np.arange(steps + 1)[:, None]
-        obs = self.observation[episode, rows].astype(np.float32)
-        action = self.action[episode, rows[:-1]].astype(np.float32)
-        reward = self.reward[episode, rows[:-1]]
-        return obs.swapaxes(1, 2), action.swapaxes(1, 2), reward, (episode, start)
+        ends = np.cumsum(np.maximum(self.lengths - steps + 1, 0))  # of each episode's starts
+        fac.need(len(ends) and ends[-1], f"no episode has the {steps} decisions to learn from; "
+                 "lower the horizon")
+        drawn = rng.integers(ends[-1], size=batch)
+        episode = np.searchsorted(ends, drawn, "right")
+        start = drawn - ends[episode] + self.lengths[episode] - steps + 1
+        rows = self.begins[episode] + start + np.arange(steps + 1)[:, None]
+        obs = self.observation[rows].astype(np.float32)
+        action = self.action[rows[:-1]].astype(np.float32)
+        return obs.swapaxes(1, 2), action.swapaxes(1, 2), self.reward[rows[:-1]], (episode, start)
+
+    def continues(self, where, steps):
+        """Of segments that begin there, (H, B), float32: 0 where a decision's next state ended the
+        episode, so that nothing is worth anything beyond it, else 1, also where the time did."""
+        episode, start = where
+        last = start + np.arange(1, steps + 1)[:, None] == self.lengths[episode]
+        return np.float32(~(last & self.terminated[episode]))
 
     def write(self, path, header, episodes=0):
         """A file for `Replay` with `episodes` (0: all that are held), oldest first, spread evenly
         over training: the newest alone don't show a student what to do once it has fallen. An
         episode's last row has no action. header names the task, for `spread_targets`."""
-        held = np.arange(self.count - len(self), self.count) % len(self.reward)
-        count = min(episodes or len(held), len(held))
-        order = held[::-1][np.arange(count) * len(held) // count][::-1]
-        action = np.zeros((len(order), self.steps + 1, self.action.shape[2]), np.float32)
-        action[:, :-1] = self.action[order]
-        continues = np.ones(action.shape[:2], bool)
-        continues[:, -1] = False
-        observation = self.observation[order].reshape(-1, self.observation.shape[2])
+        count = min(episodes or len(self), len(self))
+        order = np.arange(len(self))[::-1][np.arange(count) * len(self) // count][::-1]
+        lengths = self.lengths[order] + 1
+        rows = np.concatenate([begin + np.arange(n)
+                               for begin, n in zip(self.begins[order], lengths)])
+        continues = np.ones(len(rows), bool)
+        continues[np.cumsum(lengths) - 1] = False
+        observation = self.observation[rows]
         spread_targets(header["task"], observation, fac.stream(0, "replay targets"))
         fac.write_npz(path, {"kind": "replay", **header}, {
-            "observation": fac.compact(observation), "continues": continues.ravel(),
-            "action": fac.compact(action.reshape(-1, action.shape[2]))},
-            compress=True)
+            "observation": fac.compact(observation), "continues": continues,
+            "action": fac.compact(self.action[rows])}, compress=True)
 
 
 def make_learner(args, sizes, config):
     """NumPy's learner or PyTorch's, both from the same fresh weights.
 
-    Either has `update(obs, actions, reward, rng)`, the number of `updates` made, its `model` as
-    fac.WorldModel, `state()` and `load(arrays)`, and `about`, for the expert's file.
+    Either has `update(obs, actions, reward, rng, continues)`, the number of `updates` made, its
+    `model` as fac.WorldModel, `state()` and `load(arrays)`, and `about`, for the expert's file.
     """
     rng = fac.stream(args.seed, "expert")
     if args.backend == "numpy":
@@ -252,7 +296,7 @@ class OnlineStudent:
         return divergences
 
 
-def move_target(obs, reward, back, chosen, task):
+def move_target(obs, reward, back, chosen, task, action_repeat=fac.ACTION_REPEAT):
     """Move the target of reacher segments back by `back` (B, 2) where chosen (B,), in place.
 
     The observation is (3 joints, 2 finger-to-target, 3 velocities) and the dynamics don't know
@@ -263,7 +307,7 @@ def move_target(obs, reward, back, chosen, task):
     radius = fac.REACHER_TARGET[fac.lookup_task(task)[1]] + FINGER_RADIUS
     obs[:, chosen, 3:5] -= back[chosen]
     distance = np.linalg.norm(obs[1:, chosen, 3:5], axis=-1)
-    reward[:, chosen] = fac.ACTION_REPEAT * (distance <= radius)
+    reward[:, chosen] = action_repeat * (distance <= radius)
 
 
 def draw_targets(obs, rng):
@@ -274,7 +318,7 @@ def draw_targets(obs, rng):
     return radius * np.stack([np.cos(angle), np.sin(angle)]) - finger
 
 
-def hindsight(task, buffer, where, obs, reward, rng):
+def hindsight(task, buffer, where, obs, reward, rng, action_repeat=fac.ACTION_REPEAT):
     """Give three quarters of reacher's segments another target, in place [D6].
 
     Two thirds of these: where the finger is at a later step of the same episode; one third: drawn
@@ -284,10 +328,11 @@ def hindsight(task, buffer, where, obs, reward, rng):
     if not task.startswith("reacher"):
         return
     episode, start = where
-    later = buffer.observation[episode, rng.integers(start + 1, buffer.steps + 1), 3:5]
+    row = buffer.begins[episode] + rng.integers(start + 1, buffer.lengths[episode] + 1)
     moved, fresh = rng.random((2, len(start))) < [[3 / 4], [1 / 3]]
-    back = np.where(fresh, obs[0, 3:5] - draw_targets(obs[0], rng), later.T).T
-    move_target(obs.swapaxes(1, 2), reward, back.astype(np.float32), moved, task)
+    back = np.where(fresh, obs[0, 3:5] - draw_targets(obs[0], rng),
+                    buffer.observation[row, 3:5].T).T
+    move_target(obs.swapaxes(1, 2), reward, back.astype(np.float32), moved, task, action_repeat)
 
 
 def spread_targets(task, observation, rng):
@@ -319,8 +364,9 @@ class Training:
             sizes, config.batch_size * (config.horizon + 1)), config)
         fac.check_memory(fac.planning_numbers(sizes, planning), planning, sizes)
         self.learner = make_learner(args, sizes, config)
+        self.steps = fac.task_steps(args.task, planning)
         new_buffer = functools.partial(ReplayBuffer, dim_obs, dim_action, config.buffer_size,
-                                       np.dtype(config.buffer_dtype))
+                                       np.dtype(config.buffer_dtype), self.steps)
         self.buffer = new_buffer()
         self.student = distilling and OnlineStudent(self.learner.model, args.num_agents,
                                                     distilling, args.seed, new_buffer())
@@ -329,6 +375,7 @@ class Training:
             "task", "seed", "backend", "envs", "refresh", "evaluate_every", "num_agents")}
         self.settings["config"] = dataclasses.asdict(config)
         self.settings["distill"] = dataclasses.asdict(distilling) if distilling else {}
+        self.settings["action_repeat"] = planning.action_repeat
         # these, like the planner, may change between two stretches of a run
         self.settings["config"].pop("updates_per_step")
         self.settings["distill"].pop("steps", None)
@@ -366,7 +413,7 @@ class Training:
     def explorations(self):
         """A round's training episodes, then as many of the student's own, as `Actors.begin` takes
         them."""
-        first, std = self.decisions // fac.EPISODE_STEPS, self.scheduled()["exploration_std"]
+        first, std = self.decisions // self.steps, self.scheduled()["exploration_std"]
         follows = self.student and self.student.config.played_share and not self.warming
         return [(seed, player, deviation) for use, player, deviation, count in (
             ("training episode", "explorer", std, self.args.envs),
@@ -395,8 +442,9 @@ class Training:
         rng = fac.stream(self.args.seed, "update", updates)
         steps = max(H, self.student.config.horizon + 1) if self.student else H
         obs, actions, reward, where = self.buffer.sample(rng, config.batch_size, steps)
-        hindsight(self.args.task, self.buffer, where, obs, reward, rng)
-        losses = self.learner.update(obs[:H + 1], actions[:H], reward[:H], rng)
+        hindsight(self.args.task, self.buffer, where, obs, reward, rng, self.planning.action_repeat)
+        losses = self.learner.update(obs[:H + 1], actions[:H], reward[:H], rng,
+                                     self.buffer.continues(where, H))
         losses += self.student.update(self.learner.model, obs[0], actions) if self.student else [
             0.0, 0.0]
         fac.check_finite({"losses are": losses}, updates + 1, config.lr)
@@ -415,7 +463,7 @@ class Training:
 
         Evaluations are of the weights at the round's start: they belong to the row before.
         """
-        envs, quota, began = self.args.envs, self.args.envs * fac.EPISODE_STEPS, time.time()
+        envs, quota, began = self.args.envs, self.args.envs * self.steps, time.time()
         warming, row = self.warming, {**dict.fromkeys(CURVE), **self.scheduled()}
         tested = self.curve and not warming and self.decisions % self.args.evaluate_every < quota
         tests, planners = (self.tests(), self.planners()) if tested else ([], {})
@@ -423,22 +471,24 @@ class Training:
         actors.begin(playing + tests)
         losses, start = [], self.learner.updates
         due = 0 if warming else int(self.allowed) - start
-        for played in range(0, fac.EPISODE_STEPS, self.args.refresh):
-            end = min(played + self.args.refresh, fac.EPISODE_STEPS)
+        for played in range(0, self.steps, self.args.refresh):
+            end = min(played + self.args.refresh, self.steps)
             actors.play(end - played, {**planners, **self.explorers()})
-            losses += self.learn_until(start + due * end // fac.EPISODE_STEPS, bar)
+            losses += self.learn_until(start + due * end // self.steps, bar)
             actors.wait()
             planners = {}
         episodes = actors.episodes()
-        for (_, player, _), episode in zip(playing, episodes):
-            (self.student.own if player == "own" else self.buffer).add(*episode)
+        for (_, player, _), played in zip(playing, episodes):
+            for episode in played:
+                (self.student.own if player == "own" else self.buffer).add(*episode)
         self.decisions += quota
         if warming and not self.warming:  # one round's behind, as later
             losses = self.learn_until(int(self.allowed), bar)
         self.allowed += self.config.updates_per_step * quota
         self.seconds += time.time() - began
         self.note(tests, episodes[len(playing):])
-        returns = [float(reward.sum()) for *_, reward in episodes[:envs]]
+        returns = [float(reward.sum()) for played in episodes[:envs]  # the last one was cut off
+                   for *_, reward, _ in played[:-1] or played]
         row.update(decisions=self.decisions, updates=self.learner.updates,
                    seconds=round(self.seconds, 1), return_mean=float(np.mean(returns)),
                    return_min=min(returns), return_max=max(returns))
@@ -449,7 +499,7 @@ class Training:
     def note(self, tests, episodes):
         """Put an evaluation's mean returns, if there was one, into the last row."""
         for name in dict.fromkeys(name for _, name in tests):
-            returns = [reward.sum() for (_, player), (*_, reward) in zip(tests, episodes)
+            returns = [reward.sum() for (_, player), ((*_, reward, _),) in zip(tests, episodes)
                        if player == name]
             self.curve[-1][f"eval_{name}"] = float(np.mean(returns))
 
@@ -459,7 +509,7 @@ class Training:
         self.learn_until(int(self.allowed), bar)
         self.curve[-1]["updates"] = self.learner.updates
         actors.begin(tests := self.tests())
-        for played in range(0, fac.EPISODE_STEPS, 25):  # actors notice soon if this process ends
+        for played in range(0, self.steps, 25):  # actors notice soon if this process ends
             actors.play(25, {} if played else self.planners())
             actors.wait()
         self.note(tests, actors.episodes())
@@ -520,14 +570,16 @@ def read_settings(args):
     """(training, planning, distillation or None) of a command line; UserError if they don't fit."""
     config = fac.from_args(ExpertConfig, args, **TRAINING_DEFAULTS)
     planning = fac.from_args(fac.PlannerConfig, args, horizon=config.horizon,
-                             discount=config.discount)
+                             discount=config.discount, action_repeat=fac.task_repeat(args.task))
     distilling = fac.from_args(fac.DistillConfig, args, **FOLLOWING_DEFAULTS)
     fac.need(0 <= args.minutes < np.inf, f"--minutes: expected 0 or more, found {args.minutes}")
     if not planning.min_std <= config.std_start <= planning.max_std:
         raise fac.UserError(f"training: std_start must lie between the planner's min_std and "
                             f"max_std ({planning.min_std}, {planning.max_std}), not "
                             f"{config.std_start}")
-    quota = args.envs * fac.EPISODE_STEPS
+    quota = args.envs * fac.task_steps(args.task, planning)
+    if args.steps is None:
+        args.steps = -(-DECISIONS // quota) * quota
     fac.need(args.steps and args.steps % quota == 0, f"--envs {args.envs} needs --steps of whole "
              f"rounds of {quota}, not {args.steps}")
     fac.need(args.student or args.num_agents is None, "--num-agents needs --student")
@@ -563,7 +615,8 @@ def train_in(out, args, config, planning, distilling):
                      "replace it; choose another --out")
     left = config.updates_per_step * max(0, args.steps - training.decisions)
     began, done = time.time(), False
-    with contextlib.closing(Actors(args.task, min(args.workers, args.envs))) as actors, \
+    with contextlib.closing(Actors(args.task, min(args.workers, args.envs),
+                                   planning.action_repeat)) as actors, \
             fac.one_thread(), fac.progress("training", int(training.allowed + left), "update",
                                            training.learner.updates) as bar:
         while not done and not (args.minutes and time.time() - began > 60 * args.minutes):
@@ -589,12 +642,12 @@ def export(training, out, result):
     """Write replay and models with their returns, and the picture; print a table; the result."""
     args, config = training.args, training.config
     about = {"task": args.task, "seed": args.seed, "decisions": training.decisions,
-             "updates": result["updates"], "action_repeat": fac.ACTION_REPEAT,
+             "updates": result["updates"], "action_repeat": training.planning.action_repeat,
              **training.learner.about,
              "training": dataclasses.asdict(config),
              "training_planner": dataclasses.asdict(training.planning)}
     training.buffer.write(out / "replay.npz", about,
-                          max(1, args.replay // fac.EPISODE_STEPS))
+                          max(1, int(args.replay / training.buffer.lengths.mean())))
     rows = [("", "return", "ms a decision")]
     for kind, model in training.models.items():
         header, prefix = {"kind": kind, **about}, "" if kind == "expert" else "student_"
@@ -636,7 +689,7 @@ def draw(path, curve, title):
         points = [(row["decisions"], row[key]) for row in curve if row[key] is not None]
         if points:
             axes.plot(*zip(*points), label=label, **style)
-    axes.set(xlabel="decisions (two environment steps each)", ylabel="return", title=title)
+    axes.set(xlabel="decisions", ylabel="return", title=title)
     axes.legend()
     fac.save_figure(path, figure)
 
@@ -650,8 +703,8 @@ def make_parser():
     add, natural = parser.add_argument, fac.natural
     positive = functools.partial(natural, least=1)
     add("--task", default="reacher-easy", help="one of: " + fac.task_names())
-    add("--steps", type=natural, default=30_000, help="decisions in all, two environment steps "
-        "each; a run that is over goes on with more [30000]")
+    add("--steps", type=natural, help="decisions in all; a run that is over goes on with more "
+        "[30000, or what makes whole rounds]")
     add("--seed", type=natural, default=0, help="[0]")
     add("--student", choices=("fac",), help="fac: after each update of the expert, one of a "
         "factored student on states of its batch")
@@ -680,7 +733,7 @@ def make_parser():
     add("--json", action="store_true", help="print one JSON object as the last line of stdout")
     fac.add_config(parser, ExpertConfig, **TRAINING_DEFAULTS)
     fac.add_config(parser, fac.PlannerConfig, "MPPI while training", "plan-",
-                   skip=("discount", "action_repeat"))
+                   skip=("discount",))
     fac.add_config(parser, fac.DistillConfig, "The student (Algorithm 1), on the expert's batches "
                    "and steps", "distill-", skip=NOT_ONLINE, **FOLLOWING_DEFAULTS)
     parser.set_defaults(run=train)

@@ -226,7 +226,7 @@ def test_what_a_robot_does_to_its_arrays_reaches_no_record():
     assert np.abs(actions).max() <= 1 and np.array_equal(obs[:, 1:, 2], actions[:, :-1, 0])
     episode = train_expert.Episode(Robot(), 3)
     episode.play(None, 6)
-    obs, actions, reward = episode.arrays()
+    obs, actions, reward, _ = episode.arrays()
     assert obs[:, 0].tolist() == [*range(7)] and np.abs(actions).max() <= 1
     assert np.array_equal(obs[1:, 2], actions[:, 0]) and reward.tolist() == [1] * 6
 

@@ -980,7 +980,8 @@ def test_an_action_repeat_goes_with_the_files_through_distill_and_evaluate(tmp_p
         out = tmp_path / str(repeat)
         assert import_expert.main([*command, str(repeat), "--out", str(out)]) == 0
         replay = fac.Replay(out / "replay.npz")
-        assert replay.transitions == 3 * 40 // repeat and replay.header["action_repeat"] == repeat
+        assert replay.transitions == 3 * (40 // repeat - 1)
+        assert replay.header["action_repeat"] == repeat
     assert made == [(2,), (4,)]
     distill = ["distill", "--task", TASK, "--expert", str(tmp_path / "4"), "--steps", "4",
                "--expert-episodes", "1", "--episodes", "1", "--plan-samples", "4", "--batch-size",
@@ -994,35 +995,38 @@ def test_an_action_repeat_goes_with_the_files_through_distill_and_evaluate(tmp_p
     assert fac.main(distill) == 0
     assert fac.main(["evaluate", "--model", str(tmp_path / "run" / "student.npz"), "--workers", "0",
                      "--episodes", "1", "--samples", "4"]) == 0
-    assert set(made) == {(), (4,)} and len(played) == 5  # (): whether there is any
-    assert {found[2].shape[1] for found in played} == {10}
+    assert set(made) == {(2,), (4,)} and len(played) == 7  # (2,): whether there is any
+    assert [found[2].shape[1] for found in played] == [20] + [10] * 6
     header, _ = fac.read_npz(tmp_path / "run" / "student.npz", ("student",))
     assert fac.made_for(header, "student.npz")["action_repeat"] == 4
     header["action_repeat"] = 7
     refusal(lambda: fac.made_for(header, "student.npz"), "student.npz: header: action_repeat")
 
 
-def test_collected_episodes_differ_in_start_and_noise(monkeypatch, tmp_path):
-    made = []
+def test_collected_episodes_differ_in_start_and_noise_and_end_with_the_robot(monkeypatch, tmp_path):
+    class Robot:
+        """Its episode is over after 5 decisions, or 7."""
+        episode_steps, made = 9, []
 
-    class Played:
-        def __init__(self, environment, seed, exploration_std):
-            made.append((seed, exploration_std))
+        def reset(self, seed):
+            self.made.append([seed])
+            return np.zeros(8)
 
-        def play(self, planner, decisions):
-            pass
+        def step(self, action):
+            self.made[-1].append(action)
+            return np.full(8, len(self.made[-1])), 1.0, len(self.made[-1]) == 6 + len(self.made) % 2
 
-        def arrays(self):
-            return np.zeros((5, 8)), np.zeros((4, 3)), np.full(4, len(made))
-
-    monkeypatch.setattr(fac, "CONTROL_STEPS", 8)
-    monkeypatch.setattr(import_expert, "Episode", Played)
     fac.save_model(tmp_path / "x.npz", random_model(1), {"kind": "expert", "task": TASK})
-    buffer = import_expert.collect(tmp_path / "x.npz", None, 40, 5)
-    seeds, deviations = zip(*made)
-    assert len(set(seeds)) == len(set(deviations)) == len(buffer) == 40
-    assert 0 <= min(deviations) < 0.1 and 0.4 < max(deviations) <= import_expert.MAX_NOISE
-    assert buffer.reward[:, 0].tolist() == list(range(1, 41))
+    monkeypatch.setattr(fac, "play", lambda *args, play=fac.play: (
+        seen.append(args[-1]), play(*args))[1])
+    seen = []
+    buffer, returns = import_expert.collect(tmp_path / "x.npz", Robot(), 40, 5)
+    assert len({seed for seed, *_ in Robot.made}) == len(Robot.made) == len(buffer) == 40
+    assert returns == [6, 5] * 20 and buffer.lengths.tolist() == [5, 4] * 20
+    assert seen == [import_expert.MAX_NOISE]
+    for begin, n, (_, *actions) in zip(buffer.begins, buffer.lengths, Robot.made):
+        assert np.array_equal(buffer.action[begin:begin + n], actions[:n])
+        assert buffer.observation[begin:begin + n + 1, 0].tolist() == [0, *range(2, n + 2)]
 
 
 def test_collected_episodes_distil_and_depend_on_the_seed_alone(tmp_path, capsys, monkeypatch):
@@ -1033,12 +1037,12 @@ def test_collected_episodes_distil_and_depend_on_the_seed_alone(tmp_path, capsys
                                    "--collect", "3", "--seed", str(seed), "--json"]) == 0
     out, err = capsys.readouterr()
     result = json.loads(out.splitlines()[-1])
-    assert result["episodes"] == 3 and result["transitions"] == 60
+    assert result["episodes"] == 3 and result["transitions"] == 57
     assert len(result["returns"]) == 3 and "held" not in err
     a, b, c = (fac.Replay(tmp_path / out / "replay.npz") for out in "abc")
     assert np.array_equal(a.observation, b.observation) and np.array_equal(a.action, b.action)
     assert not np.array_equal(a.action, c.action)
-    assert a.header["task"] == TASK and np.array_equal(a.ends, [20, 41, 62])
+    assert a.header["task"] == TASK and np.array_equal(a.ends, [19, 39, 59])
     a.starts(2, 0.33)
 
     before = {path: path.read_bytes() for path in (tmp_path / "a").iterdir()}

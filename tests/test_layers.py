@@ -157,7 +157,7 @@ def credited(agents, noise=0.3, seed=9):
     tapes = collections.defaultdict(list)
     x = fac.unroll(expert, z, actions, tapes)
     predicted = [shares.sum(0) for shares in fac.run_heads(expert, x, actions, tapes)]
-    reward, q, again = fac.credit(expert, tapes, actions, predicted, agents)
+    reward, q, again = fac.credit(expert, tapes, actions, predicted, fac.ModelConfig(4, 6, agents))
     assert again is q or np.array_equal(again, q)
     return (np.stack([reward, q]), np.stack([predicted[0], (predicted[1] + predicted[2]) / 2]),
             expert, z, actions)
@@ -213,7 +213,7 @@ def test_parts_of_an_expert_that_is_a_sum_are_its_terms():
     tapes = collections.defaultdict(list)
     x = fac.unroll(expert, z, actions, tapes)
     predicted = [shares.sum(0) for shares in fac.run_heads(expert, x, actions, tapes)]
-    found = fac.credit(expert, tapes, actions, predicted, 2)[0]
+    found = fac.credit(expert, tapes, actions, predicted, pair.config)[0]
     theirs = fac.unroll(pair, z.reshape(2, 3, 3), actions)
     share = fac.run_heads(pair, theirs, actions)[0]
     assert np.allclose(share.sum(0), predicted[0])

@@ -393,6 +393,25 @@ def test_what_is_no_number_of_workers_is_refused(workers):
         fac.Planner(random_model(), workers=workers)
 
 
+def in_a_pool(workers):
+    """What a pool's process, a daemonic one, gets of a planner and of an evaluation."""
+    model, config, found = random_model(), fac.PlannerConfig(samples=4, iterations=1), []
+    for start in (lambda: fac.Planner(model, config, workers=workers).act(np.zeros(8)).shape,
+                  lambda: len(fac.play(model, "reacher-easy", config, [0], workers)[0])):
+        try:
+            found.append(start())
+        except fac.UserError as error:
+            found.append(str(error))
+    return found
+
+
+def test_a_pool_s_process_that_wants_workers_is_told_to_go_without():
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        for message in pool.apply(in_a_pool, [1]):
+            assert message.startswith("daemonic processes") and message.endswith("workers=0")
+        assert pool.apply(in_a_pool, [0]) == [(3,), 1]
+
+
 @pytest.mark.parametrize("seed", [-1, 1.5, "x"])
 def test_what_is_no_seed_is_refused_and_leaves_no_worker(seed):
     before = multiprocessing.active_children()

@@ -48,12 +48,13 @@ def test_the_buffer_drops_the_oldest_and_writes_a_replay(tmp_path, dtype):
     assert obs.dtype == action.dtype == reward.dtype == np.float32
     assert set(np.unique(obs)) == {2, 3} and np.array_equal(reward, obs[:3, 0])
     for h in range(3):
-        assert np.array_equal(action[h].T, buffer.action[episodes, start + h].astype(np.float32))
+        rows = buffer.begins[episodes] + start + h
+        assert np.array_equal(action[h].T, buffer.action[rows].astype(np.float32))
     buffer.write(tmp_path / "replay.npz", {"task": "reacher-easy"})
     replay = fac.Replay(tmp_path / "replay.npz")
     assert replay.transitions == 2 * fac.EPISODE_STEPS
     assert replay.observation[0, 0] == 2 and replay.observation[-1, 0] == 3  # oldest first
-    assert np.allclose(replay.action[:500], buffer.action[1], atol=1e-3)
+    assert np.allclose(replay.action[:501], buffer.action[501:], atol=1e-3)
     buffer.write(tmp_path / "replay.npz", {"task": "reacher-easy"}, episodes=1)
     assert set(fac.Replay(tmp_path / "replay.npz").observation[:, 0]) == {3}  # the newest
 
@@ -114,6 +115,9 @@ def test_segments_are_in_order_and_most_get_other_targets():
     moved = ~np.isclose(obs[0, 3], walk[starts, 3])
     assert 0.67 < moved.mean() < 0.83
     assert not reward[:, ~moved].any() and reward[:, moved].any()
+    again = before[0].copy(), before[1].copy()  # of decisions of four steps
+    train_expert.hindsight("reacher-easy", buffer, where, *again, np.random.default_rng(2), 4)
+    assert set(np.unique(reward)) == {0, 2} and set(np.unique(again[1])) == {0, 4}
     # hindsight moves the target by a later finger-to-target of the episode, fresh ones are near 0
     back = walk[starts, 3] - obs[0, 3]
     reached = np.isclose(back[:, None], walk[:, 3], atol=1e-4)
@@ -205,7 +209,8 @@ def test_the_student_plays_beside_the_expert(trained, tmp_path):
     def played(folder):
         header, arrays = fac.read_npz(folder / "checkpoint.npz", ("checkpoint",))
         assert arrays["count"] == 6 and header["settings"]["distill"]["expert_episodes"] == 0
-        assert arrays["own action"].shape == (arrays["own count"], fac.EPISODE_STEPS, 3)
+        assert set(arrays["own lengths"]) <= {fac.EPISODE_STEPS}
+        assert arrays["own action"].shape == (arrays["own count"] * (fac.EPISODE_STEPS + 1), 3)
         return arrays["own count"]
 
     assert played(trained[1]) == 4
@@ -299,8 +304,8 @@ def test_expert_and_student_learn_over_their_own_horizons(horizon, monkeypatch):
     found, seen = training("--distill-horizon", str(horizon), "--distill-grad-clip", "0.5"), []
     found.buffer.add(*episode(np.random.default_rng(0), 1))
     update, perturbed, student = found.learner.update, fac.taught_batch, found.student
-    monkeypatch.setattr(found.learner, "update", lambda obs, actions, reward, rng: (
-        seen.append((len(obs), len(actions), len(reward))), update(obs, actions, reward, rng))[1])
+    monkeypatch.setattr(found.learner, "update", lambda obs, actions, reward, *rest: (
+        seen.append((len(obs), len(actions), len(reward))), update(obs, actions, reward, *rest))[1])
     monkeypatch.setattr(fac, "taught_batch", lambda *args: (
         seen.append(len(args[3])), perturbed(*args))[1])
     step = student.optimizer.step
@@ -328,7 +333,7 @@ class Still:
         pass
 
     def episodes(self):
-        return [episode(np.random.default_rng(0), 1) for _ in self.begun]
+        return [[(*episode(np.random.default_rng(0), 1), False)] for _ in self.begun]
 
 
 def test_a_round_s_episodes_go_on_with_newer_weights_in_every_part():
@@ -356,7 +361,8 @@ def test_the_expert_learns_from_segments_with_other_targets(monkeypatch):
 def test_evaluations_and_their_ratio_are_of_whom_they_name(monkeypatch, tmp_path):
     found = training("--episodes", "1")
     found.curve = [{"decisions": 500}]
-    found.note([(1, "expert"), (2, "student")], [(np.float32([3, 4]),), (np.float32([1, 1]),)])
+    found.note([(1, "expert"), (2, "student")], [[(np.float32([3, 4]), False)],
+                                                 [(np.float32([1, 1]), False)]])
     assert found.curve == [{"decisions": 500, "eval_expert": 7, "eval_student": 2}]
     found.buffer.add(*episode(np.random.default_rng(0), 1))
     workers = []
@@ -580,7 +586,8 @@ def test_actors_equal_single_environments(workers, monkeypatch):
     finally:
         actors.close()
     environment = fac.Environment(task)
-    for seed, (obs, action, reward) in zip(seeds, episodes, strict=True):
+    for seed, ((obs, action, reward, terminated),) in zip(seeds, episodes, strict=True):
+        assert not terminated
         assert obs.dtype == action.dtype == reward.dtype == np.float32
         np.testing.assert_array_equal(obs[0], environment.reset(seed))
         for t in range(3):
@@ -602,7 +609,7 @@ def test_tests_beside_the_training_are_an_evaluation():
         actors.wait()
         actors.play(300, {"explorer": (model, planning)})
         actors.wait()
-        returns = [reward.sum() for *_, reward in actors.episodes()[1:]]
+        returns = [reward.sum() for ((*_, reward, _),) in actors.episodes()[1:]]
     finally:
         actors.close()
     assert returns == fac.evaluate(model, "reacher-easy", planning, 2, 0, 0)["returns"]

@@ -1,0 +1,51 @@
+"""Robots for test_gym.py, registered as a user's own are: gym:gym_toys:Walk-v0."""
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box, Dict, Discrete
+
+
+class Walk(gymnasium.Env):
+    """Falls after 2 to 9 steps, by its seed; 12 are the time limit. It keeps what it was told."""
+
+    observation_space = Box(-np.inf, np.inf, (3,), np.float64)
+    action_space = Box(np.float32([-2, 0]), np.float32([2, 10]))
+
+    def __init__(self, falls=True):
+        self.falls, self.told = falls, []
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        self.left = self.np_random.integers(2, 10) if self.falls else 99
+        self.state = np.array([0.0, self.left / 10, 0.0])
+        return self.state, {}
+
+    def step(self, action):
+        self.told.append(action.copy())
+        self.left -= 1
+        self.state += [0.1, -0.1, 0]  # in place
+        self.state[2] = action[0]
+        action *= 0
+        return self.state, 1.0, bool(self.left == 0), False, {}
+
+
+class Told(Walk):
+    """With spaces that an option names."""
+
+    def __init__(self, **spaces):
+        super().__init__()
+        for name, space in spaces.items():
+            setattr(self, f"{name}_space", space)
+
+
+SPACES = {
+    "Discrete": {"action": Discrete(3)}, "Dict": {"observation": Dict({"a": Box(0, 1, (2,))})},
+    "Image": {"observation": Box(0, 255, (8, 8, 3), np.uint8)},
+    "Unbounded": {"action": Box(-np.inf, np.inf, (2,))}, "Whole": {"action": Box(0, 9, (2,), int)},
+    "Empty": {"action": Box(-1, 1, (0,))}}
+
+if "Walk-v0" not in gymnasium.registry:
+    gymnasium.register("Walk-v0", Walk, max_episode_steps=12)
+    gymnasium.register("Stroll-v0", Walk, max_episode_steps=12, kwargs={"falls": False})
+    gymnasium.register("Endless-v0", Walk, kwargs={"falls": False})
+    for name, spaces in SPACES.items():
+        gymnasium.register(f"{name}-v0", Told, max_episode_steps=12, kwargs=spaces)
