@@ -311,25 +311,56 @@ D4RL_ENDS = "terminals", "timeouts"
 
 
 def read_hdf5(path):
-    """{name: array} of what a replay needs of the root of an HDF5 file, by way of h5py. Of the
-    file's own bytes alone: it may name others."""
+    """{name: array} of what a replay needs of an HDF5 file, by way of h5py: of its root, or joined
+    from Minari's episodes, its groups. Of the file's own bytes alone: it may name others."""
     with fac.optional("h5py for HDF5", "hdf5"):
         import h5py
-    found, limit = {}, min(MAX_BYTES, MAX_PIECE + MAX_RATIO * path.stat().st_size)
+    left = min(MAX_BYTES, MAX_PIECE + MAX_RATIO * path.stat().st_size)
+    theirs = [*filter(None, OWN.values())]
+
+    def arrays(group, names):
+        nonlocal left
+        found = {}
+        for name in filter(group.__contains__, names):
+            own = type(group.get(name, getlink=True)) is h5py.HardLink
+            data = group[name] if own else None
+            need(type(data) is h5py.Dataset and not (data.external or data.is_virtual) and
+                 data.dtype.kind in "fbiu" and data.nbytes <= left, f"{name}: expected an array in "
+                 f"this file, of numbers, of at most {left} bytes")
+            found[name], left = data[()], left - data.nbytes
+        return found
+
     try:
         with h5py.File(path, "r") as file:
-            for name in filter(file.__contains__, (*OWN, *filter(None, OWN.values()), *D4RL_ENDS)):
-                own = type(file.get(name, getlink=True)) is h5py.HardLink
-                data = file[name] if own else None
-                need(type(data) is h5py.Dataset and not (data.external or data.is_virtual) and
-                     data.dtype.kind in "fbiu" and data.nbytes <= limit, f"{name}: expected an "
-                     f"array in this file, of numbers, of at most {limit} bytes")
-                found[name], limit = data[()], limit - data.nbytes
+            groups = [name for name in file if re.fullmatch("episode_[0-9]+", name)
+                      and isinstance(file.get(name, getlink=True), h5py.HardLink)]
+            if groups:
+                return from_minari({name: arrays(file[name], theirs) for name in sorted(
+                    groups, key=lambda name: int(name[8:]))})
+            found = arrays(file, (*OWN, *theirs, *D4RL_ENDS))
+            need(found, "expected observation, action and continues (README), D4RL's names, or "
+                 f"Minari's groups, found {', '.join(map(short, [*file][:9])) or 'nothing'}")
+            return found
     except fac.UserError:
         raise
     except Exception as error:  # the library's own, mostly
         raise fac.UserError(f"not a readable HDF5 file ({short(error)})") from None
-    return found
+
+
+def from_minari(episodes):
+    """Minari's episodes by name, of T + 1 observations and T actions each, as this project's."""
+    for name, episode in episodes.items():
+        shapes = [np.shape(episode.get(key, ())) for key in ("observations", "actions")]
+        need([*map(len, shapes)] == [2, 2] and shapes[0][0] == shapes[1][0] + 1 > 1,
+             f"{name}: expected observations (T + 1, O) and actions (T, A), found "
+             f"{' and '.join(map(str, shapes))}")
+    actions = [np.pad(np.asarray(episode["actions"]), ((0, 1), (0, 0)))
+               for episode in episodes.values()]
+    continues = np.ones(sum(map(len, actions)), bool)
+    continues[np.cumsum([*map(len, actions)]) - 1] = False
+    return {"observation": np.concatenate([episode["observations"]
+                                           for episode in episodes.values()]),
+            "action": np.concatenate(actions), "continues": continues}
 
 
 # ------------------------------------------------------------------------------ the expert
@@ -371,6 +402,8 @@ def state_dict(found):
                 need(flat.setdefault(name := WRAPPERS.sub("", key), value) is value,
                      f"{short(name)}: two entries of this name")
     before = [key.removesuffix(FIRST) for key in flat if ("." + key).endswith("." + FIRST)]
+    if not before:
+        return flat
     models = [prefix for prefix in before if "target" not in prefix]
     need(len(models) < 2 or "model." in models or "" in models, f"several models: "
          f"{', '.join(map(short, models[:4]))}; save one of them alone")

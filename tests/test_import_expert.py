@@ -411,6 +411,13 @@ def test_which_names_were_found_is_said(tmp_path, state, parts):
     refusal(lambda: import_expert.find_expert(tmp_path / "model.npz", TASK), *parts)
 
 
+def test_names_of_another_method_in_a_model_are_said(tmp_path):
+    torch = pytest.importorskip("torch")
+    torch.save({"model": {"_encoder.state.0.weight": torch.zeros(4, 8)}}, tmp_path / "model.pt")
+    refusal(lambda: import_expert.find_expert(tmp_path / "model.pt", TASK),
+            "nothing among 'model._encoder.state.0.weight'", "only TD-MPC's official")
+
+
 def test_an_expert_without_policy_is_imported_with_a_word(tmp_path, capsys):
     write_state(tmp_path / "model.pt", weights(policy=False))
     assert import_expert.main([str(tmp_path / "model.pt"), "--task", TASK, "--out",
@@ -933,6 +940,30 @@ def test_d4rl_s_arrays_are_taken_by_their_names(tmp_path, suffix, kind):
     (lambda a: a.pop("actions"), "action: not there")])
 def test_other_arrays_of_d4rl_are_refused(tmp_path, change, part):
     refuse_replay(tmp_path / "data.npz", d4rl_arrays(), change, part)
+
+
+def test_minari_episodes_become_a_replay(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    rng, lengths = np.random.default_rng(0), {0: 9, 2: 4, 10: 6}  # in numbers' order, not names'
+    obs = {e: rng.standard_normal((n + 1, 8)).astype(np.float32) for e, n in lengths.items()}
+    actions = {e: rng.uniform(-1, 1, (n, 3)).astype(np.float32) for e, n in lengths.items()}
+    with h5py.File(tmp_path / "data.hdf5", "w") as file:
+        for e in (10, 0, 2):
+            file[f"episode_{e}/observations"], file[f"episode_{e}/actions"] = obs[e], actions[e]
+            file[f"episode_{e}/infos/qpos"] = np.zeros(3)
+    sizes = fac.ModelConfig(dim_obs=8, dim_action=3)
+    found = import_expert.find_replay(tmp_path / "data.hdf5", sizes)
+    np.testing.assert_array_equal(np.flatnonzero(~found["continues"]), [9, 14, 21])
+    np.testing.assert_allclose(found["observation"], np.concatenate([*obs.values()]), atol=2e-3)
+    np.testing.assert_allclose(found["action"][10:14], actions[2], atol=1e-3)
+    with h5py.File(tmp_path / "data.hdf5", "a") as file:
+        del file["episode_2/actions"]
+    with pytest.raises(fac.UserError, match=r"data.hdf5: episode_2: .* found \(5, 8\) and \(0,\)"):
+        import_expert.find_replay(tmp_path / "data.hdf5", sizes)
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["demos/obs"] = np.zeros(3)
+    with pytest.raises(fac.UserError, match="other.h5: expected observation, .* found 'demos'"):
+        import_expert.find_replay(tmp_path / "other.h5", sizes)
 
 
 def test_an_hdf5_file_holds_its_own_bytes_and_no_more_than_it_has(tmp_path):
