@@ -842,7 +842,7 @@ def make_parser():
 
     walkers = ["walker-walk", "walker-run"]
     curve = {"steps": 5000, "evaluations": 4, "episodes": 5}
-    shipped = sorted(path.parent.name for path in fac.DATA.glob("*/expert.npz"))
+    shipped = [task for task in sorted(fac.TASKS) if (fac.DATA / task / "expert.npz").exists()]
     add_runs("figure4", lambda args: distil_all(args, lambda _: FIGURE4.items()),
              "Section 5.2: Fac-TDMPC, TD-MPC in Table 2's size and the small one of B.2, and TAP, "
              "by Algorithm 1; return against steps.", shipped, **curve)
