@@ -1,0 +1,409 @@
+#!/usr/bin/env python3
+"""Section 5.7: one factored student for many tasks and robots, and Figure 10.
+
+    python data/multitask.py distill --tasks walker-walk hopper-hop
+    python data/multitask.py evaluate --model runs/multitask-0/student.npz
+    python data/multitask.py figure10
+
+An agent is an action slot: agent i moves joint i of every robot, in its own order. Robots of fewer
+joints lack the last agents, whose parts count nothing (`present_kl`) and which aren't planned. The
+encoder reads observations, padded with zeros to the widest, and an embedding of the task. Each
+state is taught by its own task's expert, whose Distiller draws it; a batch mixes tasks. What is
+left of the student for one task (`Multitask.of_task`) is a model like any other, which plans in the
+same time as a student of that task alone.
+"""
+import argparse
+import contextlib
+import dataclasses
+import functools
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
+import fac_tdmpc_ref as fac  # noqa: E402
+
+# ------------------------------------------------------------------------------- the student
+
+EMBEDDING = 96  # numbers that stand for a task (TD-MPC2)
+TASKS = "_embedding.0.weight"  # (1, EMBEDDING, tasks), columns of norm 1 at most
+MOST_ACTIONS = 6  # of the paper's robots here
+
+
+class TaskStudent(fac.WorldModel):
+    """One task's student: reads observations (O, B); its teacher's policy may begin plans."""
+
+    def __init__(self, config, params, teacher):
+        super().__init__(config, params)
+        self.expert = teacher
+
+    def encode(self, obs):
+        return self.encode_features(obs[None])
+
+
+class Multitask(fac.WorldModel):
+    """A student of several tasks, `dims` {task: (O, A)}; config: of the widest O and EMBEDDING.
+
+    It reads x (1, O + tasks, B): padded observations above one-hot tasks."""
+
+    def __init__(self, config, params, dims):
+        super().__init__(config, params)
+        self.dims = dims
+
+    def encode_features(self, x, tape=None):
+        obs, task = np.split(x, [self.config.dim_obs - EMBEDDING], 1)
+        z = super().encode_features(np.concatenate([obs, self.params[TASKS] @ task], 1), tape)
+        if tape is not None:
+            tape.append(task)
+        return z
+
+    def encode_backward(self, dz, tape, grads):
+        task = tape.pop()
+        dx = super().encode_backward(dz, tape, grads)
+        grads[TASKS] += dx[:, -EMBEDDING:] @ task.swapaxes(1, 2)
+        return dx
+
+    def of_task(self, task, teacher=None):
+        """A copy of what a task's robot needs of the weights; its embedding is part of a bias."""
+        k, (dim_obs, dim_action) = [*self.dims].index(task), self.dims[task]
+        n = min(self.config.num_agents, dim_action)
+        sizes = dataclasses.replace(self.config, dim_obs=dim_obs, dim_action=dim_action,
+                                    num_agents=n)
+        params = {key: value[:n] for key, value in self.params.items() if key != TASKS}
+        for name in ("_dynamics", "_reward", "_Q1", "_Q2"):  # no columns for actions it lacks
+            own = params[f"{name}.0.weight"][:, :, :sizes.latent_dim + sizes.agent_actions]
+            params[f"{name}.0.weight"] = own
+        W = params["_encoder.0.weight"]
+        embedded = W[:, :, -EMBEDDING:] @ self.params[TASKS][:, :, k:k + 1]
+        params["_encoder.0.bias"] = params["_encoder.0.bias"] + embedded
+        params["_encoder.0.weight"] = W[:, :, :dim_obs]
+        for key in ("_encoder.2.weight", "_encoder.2.bias"):
+            params[key] = params[key][:, :n * sizes.latent_dim]
+        return TaskStudent(sizes, {key: v.copy() for key, v in params.items()}, teacher)
+
+
+def weights(config):
+    """How many a model of these sizes has."""
+    return sum(shape[0] * shape[1] * (shape[2] + 1) for _, _, _, shape, _ in fac.layers(config))
+
+
+def student_sizes(dims, centralized):
+    """A ModelConfig: an agent for each of the most actions; centralized: one agent, with the same
+    encoder, so as many latent features in all, and about as many weights."""
+    dim_obs, dim_action = np.max([*dims.values()], 0).tolist()
+    sizes = fac.student_config(fac.ModelConfig(dim_obs + EMBEDDING, dim_action), dim_action,
+                               "observation")
+    if not centralized:
+        return sizes
+    of_width = functools.partial(dataclasses.replace, sizes, num_agents=1,
+                                 latent_dim=dim_action * sizes.latent_dim)
+    return min((of_width(mlp_dim=width) for width in range(1, 1024)),
+               key=lambda one: abs(weights(one) - weights(sizes)))
+
+
+def save(path, student, header):
+    """A multi-task student's file."""
+    tasks = {task: list(dims) for task, dims in student.dims.items()}
+    fac.write_npz(path, {**header, "kind": "multitask", "tasks": tasks,
+                         "model": vars(student.config)}, student.params)
+
+
+def load(path):
+    """(Multitask, header) of a file; UserError names what is wrong in it."""
+    header, arrays = fac.read_npz(path, ("multitask",))
+    config = fac.from_dict(fac.ModelConfig, header.get("model"), f"{path}: header: model")
+    dims = header.get("tasks")
+    fac.need(isinstance(dims, dict) and dims, f"{path}: header: tasks: expected sizes by task, "
+             f"found {dims!r}")
+    for task, found in dims.items():
+        expected = list(fac.lookup_task(task)[2:])
+        fac.need(found == expected, f"{path}: header: tasks: {task}: expected {expected}, found "
+                 f"{found!r}")
+    shapes = {TASKS: (1, EMBEDDING, len(dims))}
+    for name, i, _, shape, _ in fac.layers(config):
+        shapes.update({f"{name}.{i}.weight": shape, f"{name}.{i}.bias": (*shape[:2], 1)})
+    for key in {**shapes, **arrays}:
+        value = arrays.get(key, np.zeros(0))
+        fac.need(value.shape == shapes.get(key) and value.dtype == fac.F32 and
+                 np.isfinite(value).all(), f"{path}: {key}: expected finite float32 "
+                 f"{shapes.get(key, 'nothing')}, found {value.dtype} {value.shape}")
+    return Multitask(config, arrays, {task: tuple(found) for task, found in dims.items()}), header
+
+
+# ------------------------------------------------------------------------------ distillation
+
+def present_kl(student, expert, *settings):
+    """`soft_kl`, but exactly 0, like its gradient, where the expert's part is NaN: of an agent that
+    the robot lacks."""
+    lacks = np.isnan(expert)
+    return fac.soft_kl(*(np.where(lacks, 0, shares) for shares in (student, expert)), *settings)
+
+
+class MultitaskDistiller(fac.Distiller):
+    """Algorithm 1 with teachers {task: Distiller}, each of which draws its own task's states and
+    has what its expert predicts there. saved: {step: path} of files written on the way."""
+
+    loss = staticmethod(functools.partial(fac.distill_loss, divergence=present_kl))
+
+    def __init__(self, teachers, config, centralized=False, seed=0, saved=()):
+        self.teachers, self.saved = teachers, dict(saved)
+        self.dims = {task: (teacher.replay.dim_obs, teacher.replay.dim_action)
+                     for task, teacher in teachers.items()}
+        widest = max(teachers.values(), key=lambda teacher: teacher.replay.dim_action)
+        super().__init__(widest.expert, widest.replay, dataclasses.replace(
+            config, expert_episodes=0), seed=seed, **vars(student_sizes(self.dims, centralized)))
+        self.pool_size = max(self.pool_size, fac.PART * len(teachers))  # which holds all tasks
+
+    def create(self, expert, sizes, seed):
+        """(Adam, student): embeddings of norm 1, at right angles, beside fresh weights."""
+        _, student = fac.new_student(expert, sizes, seed)
+        embedding = fac.orthogonal(fac.stream(seed, "embedding"), 1, EMBEDDING, len(self.dims))
+        optimizer = fac.Adam({**student.params, TASKS: embedding})
+        return optimizer, Multitask(sizes, optimizer.params, self.dims)
+
+    def draw(self, number, part, size):
+        """As Distiller's, of one task, padded; NaN: the parts of agents that it lacks."""
+        task = [*self.teachers][k := (number + part) % len(self.teachers)]
+        features, actions, targets = self.teachers[task].draw(number, part, size)
+        (dim_obs, dim_action), sizes = self.dims[task], self.student.config
+        above = len(self.dims)
+        x = np.pad(features, ((0, 0), (0, sizes.dim_obs - EMBEDDING - dim_obs + above), (0, 0)))
+        x[:, k - above] = 1
+        actions = np.pad(actions, ((0, 0), (0, sizes.dim_action - dim_action), (0, 0), (0, 0)))
+        lacking = sizes.num_agents - len(targets[0])
+        return x, actions, [np.pad(target, ((0, lacking), *[(0, 0)] * 3), constant_values=np.nan)
+                            for target in targets]
+
+    def step(self):
+        """As Distiller's; then embeddings longer than 1 are shortened to 1, as TD-MPC2 does."""
+        losses, embedding = super().step(), self.student.params[TASKS]
+        embedding /= np.maximum(1, np.linalg.norm(embedding, axis=1, keepdims=True))
+        return losses
+
+    def run(self):
+        for losses in super().run():
+            if self.t in self.saved:
+                fac.check_finite({"weights are": self.optimizer.vector}, self.t, self.config.lr)
+                save(self.saved[self.t], self.student, {"step": self.t})
+            yield losses
+
+    def refresh(self):
+        """Give the teachers their own parts of the student, as it is now."""
+        for task, teacher in self.teachers.items():
+            teacher.student = self.student.of_task(task)
+
+    def ranks(self, states, discount):
+        """`rank_correlation`'s means over the tasks, which share the states."""
+        self.refresh()
+        each = -(-states // len(self.teachers))
+        return np.mean([fac.rank_correlation(teacher, each, discount)
+                        for teacher in self.teachers.values()], 0)
+
+
+def small_tasks():
+    """The tasks in data/ whose robots have at most MOST_ACTIONS action dimensions."""
+    found = sorted(path.parent.name for path in fac.DATA.glob("*/expert.npz"))
+    return [task for task in found if fac.lookup_task(task)[3] <= MOST_ACTIONS]
+
+
+def task_list(args):
+    """The tasks of --tasks, or `small_tasks`; UserError: one is unknown, or twice there."""
+    tasks = [task for text in args.tasks for task in text.split(",")] or small_tasks()
+    for task in tasks:
+        fac.lookup_task(task)
+        fac.need(tasks.count(task) == 1, f"--tasks: {task} is there twice")
+    fac.need(tasks, f"{fac.DATA}: no expert of at most {MOST_ACTIONS} action dimensions; name "
+             "--data and --tasks")
+    return tasks
+
+
+def load_expert(task, data):
+    """(expert, header, path) of a task in data/, or in the folder `data`."""
+    path = Path(data) / task / "expert.npz" if data else fac.data_file(task, "expert.npz")
+    return *fac.load_model(path, ["expert"]), path
+
+
+def let_play(teacher, task, planning, workers, folder):
+    """Let a teacher's policy play its episodes [D8]; what any run has played before is read from
+    `folder`."""
+    about = {"data": fac.data_checksums(teacher.expert, teacher.replay), "seed": teacher.seed,
+             "episodes": teacher.config.expert_episodes, "planner": vars(planning),
+             "versions": fac.software()}
+    path = folder / f"{task}-{fac.zlib.crc32(json.dumps(about).encode()):08x}.npz"
+    if not path.exists():
+        found = fac.expert_episodes(teacher, task, planning, workers)
+        fac.write_npz(path, {"kind": "played", **about}, dict(zip(("obs", "action"), found)))
+    teacher.add(*fac.read_npz(path, ("played",))[1].values())
+
+
+def distil(tasks, config, out, seed=0, centralized=False, data=None, workers=None, marks=()):
+    """Distil a student of the tasks into the folder `out`, or go on there; result.
+
+    marks: shares of the steps after which it is saved, too, as step-N.npz. data: a folder with
+    TASK/expert.npz and replay.npz."""
+    teachers, plannings, out = {}, {}, Path(out)
+    with contextlib.ExitStack() as stack:
+        for task in tasks:
+            expert, header, replay, path = fac.load_data(argparse.Namespace(
+                task=task, expert=data and Path(data) / task, replay=None))
+            plannings[task] = fac.PlannerConfig(**fac.made_for(header, path))
+            teachers[task] = stack.enter_context(contextlib.closing(fac.Distiller(
+                expert, replay, config, 1 if centralized else None, seed)))
+        saved = {step: out / f"step-{step}.npz" for step in marked(config.steps, marks)}
+        distiller = stack.enter_context(contextlib.closing(MultitaskDistiller(
+            teachers, config, centralized, seed, saved)))
+        stack.enter_context(fac.locked(out))
+        settings = {"of": {task: fac.data_checksums(teacher.expert, teacher.replay)
+                           for task, teacher in teachers.items()},
+                    "seed": seed, "centralized": centralized, "distill": vars(config)}
+        if (path := out / "student.npz").exists():
+            before, _ = fac.read_npz(path, ("multitask",))
+            fac.same_settings({key: before.get(key) for key in settings}, settings, path)
+        for task, teacher in teachers.items():
+            if config.expert_episodes:
+                let_play(teacher, task, plannings[task], workers, out.parent / "played")
+        count = len(distiller.optimizer.vector)
+        print(f"{len(tasks)} tasks: {distiller.student.config.num_agents} agents, {count:,} "
+              f"weights; {config.steps:,} steps of {config.batch_size} x {config.noise_samples}; "
+              f"results in {out}", file=sys.stderr)
+        planning = next(iter(plannings.values()))
+        curve, seconds, _ = fac.train_student(distiller, out, settings, planning, workers)
+        save(out / "student.npz", distiller.student, settings)
+        distiller.refresh()
+        ranks = {task: fac.rank_results(teacher, 64, plannings[task].discount)
+                 for task, teacher in teachers.items()}
+    return {"tasks": tasks, "seed": seed, "centralized": centralized, "weights": count,
+            "num_agents": distiller.student.config.num_agents, "steps": config.steps,
+            "seconds": round(seconds, 1), "kl_reward": curve[-1][3], "kl_value": curve[-1][4],
+            "rank_correlation_returns": {
+                task: found["rank_correlation_returns"] for task, found in ranks.items()},
+            "out": str(out)}
+
+
+def marked(steps, marks):
+    """The steps that these shares of all stand for, at least one each."""
+    return [max(1, round(mark * steps)) for mark in marks]
+
+
+def read_config(args):
+    """The DistillConfig that the flags give: a single task's steps for each."""
+    steps = fac.DistillConfig.steps * len(task_list(args))
+    return fac.from_args(fac.DistillConfig, args, steps=steps, encoder_input="observation")
+
+
+def command_distill(args):
+    """distill: one student of many tasks."""
+    config = read_config(args)
+    name = "multitask-centralized" if args.centralized else "multitask"
+    result = distil(task_list(args), config, args.out or f"runs/{name}-{args.seed}", args.seed,
+                    args.centralized, args.data, args.workers)
+    fac.print_table([("task", *(f"rank correlation of G, H = {h}" for h in range(
+        config.horizon + 1))), *((task, *(f"{x:.2f}" for x in ranks)) for task, ranks in
+                                 result["rank_correlation_returns"].items())])
+    print(f"{result['out']}/student.npz, distilled in {result['seconds']:.0f} s")
+    return result
+
+
+# ---------------------------------------------------------------------------------- evaluate
+
+def planning_for(header, path, horizon, around=True):
+    """How a task's student plans, as settings of a PlannerConfig: around its teacher's policy, or
+    from nothing as any model."""
+    return {**fac.made_for(header, path), **(fac.STUDENT_PLANNING if around else {}),
+            "horizon": horizon}
+
+
+def recorded(expert, header, path, episodes, seed):
+    """The returns of an expert's episodes: those in its record; else measured, in this process."""
+    planning = fac.PlannerConfig(**fac.made_for(header, path))
+    found, _ = fac.read_records(path).get(fac.record_key(expert, planning, seed), ([], {}))
+    return found[:episodes] if len(found) >= episodes else fac.evaluate(
+        expert, header["task"], planning, episodes, seed, 0, "evaluating the teacher")["returns"]
+
+
+def command_evaluate(args):
+    """evaluate: a multi-task student's returns in each of its tasks, beside its teachers'."""
+    student, header = load(args.model)
+    settings = header.get("distill") or {}
+    horizon = fac.from_dict(fac.DistillConfig, settings, f"{args.model}: header: distill").horizon
+    tasks = [task for text in args.tasks for task in text.split(",")] or [*student.dims]
+    around, found = getattr(args, "PlannerConfig.prior") != "none", {}
+    for task in tasks:
+        fac.need(task in student.dims, f"--tasks: {task}: {args.model} is of "
+                 f"{', '.join(student.dims)}")
+        expert, own, path = load_expert(task, args.data)
+        fac.check_task(expert.config, task, path)
+        planning = fac.from_args(fac.PlannerConfig, args, **planning_for(
+            own, path, horizon, around))
+        found[task] = fac.evaluate(student.of_task(task, expert), task, planning, args.episodes,
+                                   args.seed, args.workers, task)
+        found[task]["teacher_returns"] = recorded(expert, own, path, args.episodes, args.seed)
+    means = np.array([[np.mean(of["returns"]), np.mean(of["teacher_returns"])]
+                      for of in found.values()])
+    rows = [(task, *mean, np.std(of["returns"]), of["plan_ms_median"])
+            for (task, of), mean in zip(found.items(), means)]
+    rows.append(("mean", *means.mean(0), np.nan, np.mean([row[-1] for row in rows])))
+    fac.print_table([("task", "student", "teacher", "kept", "ms a decision"), *(
+        (task, f"{mean:.0f}" + ("" if np.isnan(std) else f" ± {std:.0f}"), f"{teacher:.0f}",
+         f"{mean / max(teacher, 1e-9):.2f}", f"{ms:.1f}")
+        for task, mean, teacher, std, ms in rows)])
+    student_mean, teacher_mean = means.mean(0).tolist()
+    return {"tasks": found, "episodes": args.episodes, "seed": args.seed,
+            "return_mean": student_mean, "teacher_mean": teacher_mean,
+            "kept": fac.return_kept(student_mean, teacher_mean)}
+
+
+# ------------------------------------------------------------------------------ command line
+
+def make_parser():
+    """The command line."""
+    parser = fac.Parser(prog="multitask.py", description="One factored student for many tasks and "
+                        "robots (section 5.7), each task taught by its own expert.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    positive = functools.partial(fac.natural, least=1)
+
+    def add(name, run, help, **about):
+        sub = fac.add_command(commands, name, run, help, **about)
+        sub.add_argument("--tasks", nargs="+", default=[], metavar="TASK", help="any of: "
+                         f"{fac.task_names()} [experts in data/ of at most {MOST_ACTIONS} action "
+                         "dimensions; evaluate: the student's]")
+        sub.add_argument("--data", help="folder with TASK/expert.npz and replay.npz [data]")
+        sub.add_argument("--workers", type=fac.natural,
+                         help="processes that play episodes; 0: this one [cores]")
+        return sub
+
+    sub = add("distill", command_distill, "Distil many tasks' experts into one student.",
+              epilog="Given again, a cut-off run goes on. The policies' episodes are kept beside "
+              "--out, in played/, for other runs of the same seed.")
+    sub.add_argument("--seed", type=fac.natural, default=0, help="of distillation [0]")
+    sub.add_argument("--centralized", action="store_true", help="one agent, with the same encoder, "
+                     "about as many weights, the same states")
+    sub.add_argument("--out", help="folder for the results [runs/multitask-SEED, "
+                     "runs/multitask-centralized-SEED]")
+    add_distillation(sub)
+    sub = add("evaluate", command_evaluate, "Plan with a student in each of its tasks, by default "
+              "around its teacher's policy; with --prior none it plans alone.")
+    sub.add_argument("--model", required=True, help="a student.npz of distill, or a step-N.npz")
+    sub.add_argument("--seed", type=fac.natural, default=0, help="of the episodes [0]")
+    sub.add_argument("--episodes", type=positive, default=20, help="of each task [20]")
+    fac.add_config(sub, fac.PlannerConfig, skip=("action_repeat", "horizon"),
+                   **fac.STUDENT_PLANNING)
+    return parser
+
+
+def add_distillation(sub):
+    """Algorithm 1's flags: what a student of many tasks has no choice of isn't there."""
+    sub.add_argument("--steps", type=int, dest="DistillConfig.steps", metavar="INT",
+                     help=f"gradient steps in all [{fac.DistillConfig.steps} for each task]")
+    fac.add_config(sub, fac.DistillConfig, skip=("steps", "targets", "encoder_input"))
+
+
+def main(argv=None):
+    """Run the command line; returns the exit status."""
+    return fac.run_command(make_parser(), argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
