@@ -1,0 +1,292 @@
+"""data/multitask.py: one student for robots of 3 to 6 joints, on small experts made here."""
+import contextlib
+import csv
+import functools
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import fac_tdmpc_ref as fac
+import multitask
+import test_cli
+from test_cli import ONE_THREAD, ROOT, last_json, launch, succeeded, write_expert, write_replay
+from test_layers import assert_close, numeric_gradient
+
+SCRIPT = ROOT / "data" / "multitask.py"
+ROBOTS = {"reacher-hard": (8, 3), "hopper-hop": (15, 4), "walker-walk": (24, 6)}
+CONFIG = fac.DistillConfig(steps=40, batch_size=12, warmup=4, expert_episodes=0, held_out=0.34,
+                           horizon=2, encoder_input="observation")
+TINY = ["--batch-size", "12", "--horizon", "1", "--held-out", "0.34", "--warmup", "2",
+        "--expert-episodes", "0"]
+refused = functools.partial(test_cli.refused, program="multitask.py")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """A folder with an expert and a replay of each robot."""
+    folder = tmp_path_factory.mktemp("data")
+    for task, dims in ROBOTS.items():
+        write_expert(folder / task / "expert.npz", task, dims)
+        write_replay(folder / task / "replay.npz", dims)
+    return folder
+
+
+@contextlib.contextmanager
+def distiller_of(data, tasks=tuple(ROBOTS), config=CONFIG, centralized=False, seed=0):
+    with contextlib.ExitStack() as stack:
+        teachers = {task: stack.enter_context(contextlib.closing(fac.Distiller(
+            fac.load_model(data / task / "expert.npz")[0], fac.Replay(data / task / "replay.npz"),
+            config, 1 if centralized else None, seed))) for task in tasks}
+        yield stack.enter_context(contextlib.closing(multitask.MultitaskDistiller(
+            teachers, config, centralized, seed)))
+
+
+def in_float64(student):
+    """A copy in double precision, whose last layers aren't zero."""
+    rng = np.random.default_rng(3)
+    params = {key: value + 0.1 * rng.standard_normal(value.shape)
+              for key, value in student.params.items()}
+    return multitask.Multitask(student.config, params, student.dims)
+
+
+def loss_of(student, batch, grads=None, loss=multitask.MultitaskDistiller.loss):
+    features, actions, targets = (
+        [x.astype(float) for x in part] if isinstance(part, list) else part.astype(float)
+        for part in batch)
+    return loss(student, features, actions, targets, CONFIG, grads)[0]
+
+
+def gradients(student, batch):
+    grads = {key: np.zeros_like(value) for key, value in student.params.items()}
+    loss_of(student, batch, grads)
+    return grads
+
+
+@pytest.mark.parametrize("centralized", [False, True])
+def test_gradients_through_embedding_and_mask(data, centralized):
+    """Of a batch of all robots, by what is smallest of each network, against differences."""
+    with distiller_of(data, centralized=centralized) as distiller:
+        student, batch = in_float64(distiller.student), distiller.batch(0)
+    assert set(np.argmax(batch[0][0, -3:], 0)) == {0, 1, 2}, "a batch mixes tasks"
+    assert np.isnan(batch[2][0]).any() != centralized
+    grads = gradients(student, batch)
+    for key in (multitask.TASKS, "_encoder.0.bias", "_dynamics.4.bias", "_Q1.1.weight"):
+        value = student.params[key]
+        part = value if value.shape[1] < 60 else value[:, :60]  # a view, which differences change
+        numeric = numeric_gradient(lambda: loss_of(student, batch), part)
+        assert np.abs(numeric).max() > 1e-6
+        assert_close(grads[key][:, :part.shape[1]], numeric, 1e-5)
+
+
+@pytest.mark.parametrize("task", ROBOTS)
+def test_agents_that_a_robot_lacks_change_nothing(data, task):
+    """Bit for bit: neither the loss, nor any gradient, nor what is left for the task."""
+    with distiller_of(data) as distiller:
+        number = [*ROBOTS].index(task)
+        batch = distiller.draw(0, number, 16)
+        student, n = in_float64(distiller.student), ROBOTS[task][1]
+    grads, loss = gradients(student, batch), loss_of(student, batch)
+    own = student.of_task(task)
+    m = student.config.latent_dim
+    for key, value in student.params.items():  # what only absent agents, other tasks have
+        if key == multitask.TASKS:
+            value[..., [k for k in range(3) if k != number]] += 1
+            assert not np.delete(grads[key], number, 2).any() and grads[key][..., number].any()
+        elif key.startswith("_encoder.2"):
+            value[:, n * m:] += 1
+            assert not grads[key][:, n * m:].any() and grads[key][:, :n * m].any()
+        elif not key.startswith("_encoder"):
+            value[n:] += 1
+            assert not grads[key][n:].any()
+    assert loss_of(student, batch) == loss
+    after = gradients(student, batch)
+    assert all(np.array_equal(after[key], grads[key]) for key in grads)
+    again = student.of_task(task)
+    assert all(np.array_equal(again.params[key], own.params[key]) for key in own.params)
+
+
+@pytest.mark.parametrize("task", ROBOTS)
+@pytest.mark.parametrize("centralized", [False, True])
+def test_a_task_s_student_is_what_the_mask_leaves(data, task, centralized):
+    """Its loss by the module's own `distill_loss`, its agents' latents, rewards and Q."""
+    with distiller_of(data, centralized=centralized) as distiller:
+        k, (dim_obs, dim_action) = [*ROBOTS].index(task), ROBOTS[task]
+        padded = distiller.draw(0, k, 16)
+        batch = distiller.teachers[task].draw(0, k, 16)
+        student = in_float64(distiller.student)
+    own = student.of_task(task)
+    n = own.config.num_agents
+    assert (own.config.dim_obs, own.config.dim_action) == (dim_obs, dim_action)
+    assert n == (1 if centralized else dim_action)
+    assert np.array_equal(batch[0], padded[0][:, :dim_obs])
+    assert np.array_equal(batch[1], padded[1][:, :dim_action])
+    assert not padded[1][:, dim_action:].any() and not padded[0][:, dim_obs:24].any()
+    assert_close(own.encode(batch[0][0]), student.encode_features(padded[0])[:n], 1e-12)
+    assert_close(loss_of(own, batch, None, fac.distill_loss), loss_of(student, padded), 1e-12)
+
+
+def test_the_centralized_student_has_the_same_encoder_and_as_many_weights(data):
+    with distiller_of(data) as factored, distiller_of(data, centralized=True) as centralized:
+        one, many = centralized.student.params, factored.student.params
+        assert [x.student.config.num_agents for x in (factored, centralized)] == [6, 1]
+        assert {k: v.shape for k, v in one.items() if k[1:3] in ("en", "em")} == {
+            k: v.shape for k, v in many.items() if k[1:3] in ("en", "em")}
+        counts = [len(x.optimizer.vector) for x in (factored, centralized)]
+        assert abs(counts[0] / counts[1] - 1) < 0.01
+        for a, b in zip(factored.batch(0)[:2], centralized.batch(0)[:2]):
+            assert np.array_equal(a, b), "the same states and actions"
+
+
+def trained(data, steps, **about):
+    with distiller_of(data, **about) as distiller:
+        losses = [distiller.step() for _ in range(steps)]
+        return distiller.optimizer.vector.copy(), np.array(losses), distiller.state()
+
+
+def test_distilling_learns_repeats_and_goes_on_from_a_state(data):
+    vector, losses, _ = trained(data, 40)
+    assert losses[-8:, 0].mean() < losses[:8, 0].mean()
+    assert np.array_equal(trained(data, 40)[0], vector)
+    assert not np.array_equal(trained(data, 40, seed=1)[0], vector)
+    _, _, state = trained(data, 17)
+    with distiller_of(data) as distiller:
+        distiller.load(state)
+        for _ in range(23):
+            distiller.step()
+        assert np.array_equal(distiller.optimizer.vector, vector)
+
+
+def test_embeddings_stay_within_norm_1(data):
+    with distiller_of(data) as distiller:
+        embedding = distiller.student.params[multitask.TASKS]
+        assert_close(np.linalg.norm(embedding, axis=1), np.ones((1, 3)), 1e-6)
+        before = embedding.copy()
+        for _ in range(20):
+            distiller.step()
+        assert (np.linalg.norm(embedding, axis=1) <= 1 + 1e-6).all()
+        assert np.abs(embedding - before).max() > 1e-3, "they learn"
+        distiller.student.params[multitask.TASKS][..., 1] *= 9
+        distiller.step()
+        assert (np.linalg.norm(embedding, axis=1) <= 1 + 1e-6).all()
+
+
+# the program --------------------------------------------------------------------------
+
+
+def run(*arguments, cwd, env=ONE_THREAD):
+    return launch([SCRIPT, *arguments], cwd, env)
+
+
+@pytest.fixture(scope="module")
+def student(data, tmp_path_factory):
+    """A run of two tasks, and what distill said of it."""
+    folder = tmp_path_factory.mktemp("run")
+    return folder, last_json(run("distill", "--tasks", "reacher-hard,walker-walk", "--data", data,
+                                 "--steps", "24", "--out", "two", *TINY, "--json", cwd=folder))
+
+
+def test_two_robots_end_to_end(data, student):
+    folder, found = student
+    assert found["tasks"] == ["reacher-hard", "walker-walk"] and found["num_agents"] == 6
+    assert {k: len(v) for k, v in found["rank_correlation_returns"].items()} == {
+        "reacher-hard": 2, "walker-walk": 2}
+    model, header = multitask.load(folder / "two" / "student.npz")
+    assert header["distill"]["steps"] == 24 and model.dims == {
+        "reacher-hard": (8, 3), "walker-walk": (24, 6)}
+    assert sum(v.size for v in model.params.values()) == found["weights"]
+    with open(folder / "two" / "curve.csv", newline="") as file:
+        assert [row["step"] for row in csv.DictReader(file)][-1] == "24"
+    budget = ["--samples", "16", "--iterations", "1", "--episodes", "1", "--data", data]
+    played = [last_json(run("evaluate", "--model", "two/student.npz", *budget, *flags, "--json",
+                            cwd=folder)) for flags in (
+        ["--workers", "0"], ["--workers", "1"], ["--prior", "none", "--tasks", "walker-walk"])]
+    assert played[0]["tasks"]["walker-walk"]["returns"] == played[1]["tasks"]["walker-walk"][
+        "returns"], "the number of processes changes nothing"
+    assert set(played[0]["tasks"]) == {"reacher-hard", "walker-walk"}
+    assert set(played[2]["tasks"]) == {"walker-walk"}
+    alone, around = (found["tasks"]["walker-walk"] for found in (played[2], played[0]))
+    assert alone["returns"] != around["returns"]
+    assert len(around["teacher_returns"]) == 1 and around["plan_ms_median"] > 0
+    assert played[0]["return_mean"] == np.mean([
+        x["returns"][0] for x in played[0]["tasks"].values()])
+
+
+def test_help_is_quick(tmp_path):
+    watched = test_cli.WATCHED.replace(
+        f"sys.path.insert(0, {str(ROOT)!r})", f"sys.path.insert(0, {str(ROOT / 'data')!r})"
+    ).replace("import fac_tdmpc_ref as fac", "import multitask as fac")
+    for command in ([], ["distill"], ["evaluate"]):
+        done = succeeded(launch(["-c", watched, *command, "--help"], tmp_path))
+        assert "Traceback" not in done.stderr and "multitask.py" in done.stdout
+    assert os.listdir(tmp_path) == []
+
+
+KILLED = """
+import os, signal, sys
+sys.path.insert(0, {root!r})
+import multitask
+write = multitask.fac.write_npz
+def killing(path, header, arrays, *more):
+    write(path, header, arrays, *more)
+    if header["kind"] == "checkpoint":
+        os.kill(os.getpid(), signal.SIGKILL)
+multitask.fac.write_npz = killing
+multitask.fac.time.time = iter(range(0, 10 ** 6, 40)).__next__  # a checkpoint at every turn
+multitask.main(sys.argv[1:])
+"""
+
+
+def test_a_killed_run_goes_on_to_the_same_end(data, student, tmp_path):
+    flags = ["distill", "--tasks", "reacher-hard", "walker-walk", "--data", str(data), "--steps",
+             "24", "--out", "two", *TINY]
+    code = KILLED.format(root=str(ROOT / "data"))
+    done = subprocess.run([sys.executable, "-c", code, *flags], cwd=tmp_path, capture_output=True,
+                          text=True, env={**os.environ, **ONE_THREAD})
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    _, arrays = fac.read_npz(tmp_path / "two" / "checkpoint.npz", ("checkpoint",))
+    assert 0 < arrays["step"] < 24
+    succeeded(run(*flags, cwd=tmp_path))
+    ours, theirs = (multitask.load(folder / "two" / "student.npz")[0].params
+                    for folder in (tmp_path, student[0]))
+    assert all(np.array_equal(ours[key], theirs[key]) for key in theirs)
+    succeeded(run(*flags, cwd=tmp_path))  # a finished one stays
+    refused_line = run(*flags[:-1], "1", cwd=tmp_path)
+    refused(refused_line, "student.npz", "expert_episodes", "--out")
+
+
+@pytest.mark.parametrize("flags, parts", [
+    (["distill", "--tasks", "walker-wolk"], ["did you mean 'walker-walk'"]),
+    (["distill", "--tasks", "walker-walk,walker-walk"], ["--tasks", "walker-walk", "twice"]),
+    (["distill", "--tasks", "cheetah-run", "--data", "{data}"], ["cheetah-run", "no such file"]),
+    (["distill", "--steps", "0"], ["steps", "at least 1"]),
+    (["distill", "--targets", "joint"], ["--targets"]),
+    (["evaluate", "--model", "none.npz"], ["none.npz", "no such file"]),
+    (["evaluate", "--model", "{data}/walker-walk/expert.npz"], ["kind", "'multitask'"]),
+    (["evaluate", "--model", "{model}", "--tasks", "hopper-hop"],
+     ["hopper-hop", "is of reacher-hard, walker-walk"]),
+    (["evaluate", "--model", "{model}", "--data", "none"], ["none", "expert.npz", "no such file"]),
+    (["evaluate", "--model", "{model}", "--episodes", "0"], ["episodes", "at least 1"])])
+def test_bad_input_is_one_line(tmp_path, data, student, flags, parts):
+    values = {"data": data, "model": student[0] / "two" / "student.npz"}
+    refused(run(*(flag.format(**values) for flag in flags), cwd=tmp_path), *parts)
+
+
+@pytest.mark.parametrize("change, parts", [
+    (lambda h, a: a.pop("_dynamics.0.weight"), ["_dynamics.0.weight", "(6, 85, 51)"]),
+    (lambda h, a: a.update(x=np.zeros(1, np.float32)), ["x: expected", "nothing"]),
+    (lambda h, a: a[multitask.TASKS].fill(np.nan), [multitask.TASKS, "finite"]),
+    (lambda h, a: h.update(tasks={"walker-walk": [24, 5]}), ["walker-walk", "[24, 6]", "[24, 5]"]),
+    (lambda h, a: h.update(tasks=["walker-walk"]), ["tasks", "sizes by task"]),
+    (lambda h, a: h["model"].update(enc_dim=0), ["model", "enc_dim", "at least 1"])])
+def test_a_damaged_file_is_named(student, tmp_path, change, parts):
+    header, arrays = fac.read_npz(student[0] / "two" / "student.npz", ("multitask",))
+    change(header, arrays)
+    fac.write_npz(tmp_path / "odd.npz", json.loads(json.dumps(header)), arrays)
+    with pytest.raises(fac.UserError) as error:
+        multitask.load(tmp_path / "odd.npz")
+    assert all(part in str(error.value) for part in [*parts, "odd.npz"])
