@@ -16,6 +16,7 @@ import argparse
 import contextlib
 import dataclasses
 import functools
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -23,13 +24,17 @@ from pathlib import Path
 import numpy as np
 
 sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
+import experiments  # noqa: E402
 import fac_tdmpc_ref as fac  # noqa: E402
+import look  # noqa: E402
 
 # ------------------------------------------------------------------------------- the student
 
 EMBEDDING = 96  # numbers that stand for a task (TD-MPC2)
 TASKS = "_embedding.0.weight"  # (1, EMBEDDING, tasks), columns of norm 1 at most
+SCALES = "_scale.0.weight"  # (1, O, tasks), not trained: what observations are multiplied by
 MOST_ACTIONS = 6  # of the paper's robots here
+MARKS = (0.03, 0.1, 0.3, 1.0)  # shares of the steps after which Figure 10's students play
 
 
 class TaskStudent(fac.WorldModel):
@@ -46,7 +51,8 @@ class TaskStudent(fac.WorldModel):
 class Multitask(fac.WorldModel):
     """A student of several tasks, `dims` {task: (O, A)}; config: of the widest O and EMBEDDING.
 
-    It reads x (1, O + tasks, B): padded observations above one-hot tasks."""
+    It reads x (1, O + tasks, B): padded observations above one-hot tasks. Robots' features are of
+    very different sizes, so each is divided by its deviation in the task's replay."""
 
     def __init__(self, config, params, dims):
         super().__init__(config, params)
@@ -54,7 +60,8 @@ class Multitask(fac.WorldModel):
 
     def encode_features(self, x, tape=None):
         obs, task = np.split(x, [self.config.dim_obs - EMBEDDING], 1)
-        z = super().encode_features(np.concatenate([obs, self.params[TASKS] @ task], 1), tape)
+        x = np.concatenate([obs * (self.params[SCALES] @ task), self.params[TASKS] @ task], 1)
+        z = super().encode_features(x, tape)
         if tape is not None:
             tape.append(task)
         return z
@@ -66,19 +73,21 @@ class Multitask(fac.WorldModel):
         return dx
 
     def of_task(self, task, teacher=None):
-        """A copy of what a task's robot needs of the weights; its embedding is part of a bias."""
+        """A copy of what a task's robot needs of the weights, its scales and embedding in those of
+        the first layer."""
         k, (dim_obs, dim_action) = [*self.dims].index(task), self.dims[task]
         n = min(self.config.num_agents, dim_action)
         sizes = dataclasses.replace(self.config, dim_obs=dim_obs, dim_action=dim_action,
                                     num_agents=n)
-        params = {key: value[:n] for key, value in self.params.items() if key != TASKS}
+        params = {key: value[:n] for key, value in self.params.items()}
+        embedding, scale = (params.pop(key)[:, :, k] for key in (TASKS, SCALES))
         for name in ("_dynamics", "_reward", "_Q1", "_Q2"):  # no columns for actions it lacks
             own = params[f"{name}.0.weight"][:, :, :sizes.latent_dim + sizes.agent_actions]
             params[f"{name}.0.weight"] = own
         W = params["_encoder.0.weight"]
-        embedded = W[:, :, -EMBEDDING:] @ self.params[TASKS][:, :, k:k + 1]
+        embedded = W[:, :, -EMBEDDING:] @ embedding[..., None]
         params["_encoder.0.bias"] = params["_encoder.0.bias"] + embedded
-        params["_encoder.0.weight"] = W[:, :, :dim_obs]
+        params["_encoder.0.weight"] = W[:, :, :dim_obs] * scale[:, None, :dim_obs]
         for key in ("_encoder.2.weight", "_encoder.2.bias"):
             params[key] = params[key][:, :n * sizes.latent_dim]
         return TaskStudent(sizes, {key: v.copy() for key, v in params.items()}, teacher)
@@ -121,7 +130,8 @@ def load(path):
         expected = list(fac.lookup_task(task)[2:])
         fac.need(found == expected, f"{path}: header: tasks: {task}: expected {expected}, found "
                  f"{found!r}")
-    shapes = {TASKS: (1, EMBEDDING, len(dims))}
+    shapes = {TASKS: (1, EMBEDDING, len(dims)),
+              SCALES: (1, config.dim_obs - EMBEDDING, len(dims))}
     for name, i, _, shape, _ in fac.layers(config):
         shapes.update({f"{name}.{i}.weight": shape, f"{name}.{i}.bias": (*shape[:2], 1)})
     for key in {**shapes, **arrays}:
@@ -143,12 +153,13 @@ def present_kl(student, expert, *settings):
 
 class MultitaskDistiller(fac.Distiller):
     """Algorithm 1 with teachers {task: Distiller}, each of which draws its own task's states and
-    has what its expert predicts there. saved: {step: path} of files written on the way."""
+    has what its expert predicts there. saved: {step: path} of files written on the way, with a
+    header."""
 
     loss = staticmethod(functools.partial(fac.distill_loss, divergence=present_kl))
 
-    def __init__(self, teachers, config, centralized=False, seed=0, saved=()):
-        self.teachers, self.saved = teachers, dict(saved)
+    def __init__(self, teachers, config, centralized=False, seed=0, saved=(), header=()):
+        self.teachers, self.saved, self.header = teachers, dict(saved), dict(header)
         self.dims = {task: (teacher.replay.dim_obs, teacher.replay.dim_action)
                      for task, teacher in teachers.items()}
         widest = max(teachers.values(), key=lambda teacher: teacher.replay.dim_action)
@@ -161,7 +172,11 @@ class MultitaskDistiller(fac.Distiller):
         _, student = fac.new_student(expert, sizes, seed)
         embedding = fac.orthogonal(fac.stream(seed, "embedding"), 1, EMBEDDING, len(self.dims))
         optimizer = fac.Adam({**student.params, TASKS: embedding})
-        return optimizer, Multitask(sizes, optimizer.params, self.dims)
+        scales = np.zeros((1, sizes.dim_obs - EMBEDDING, len(self.dims)), fac.F32)
+        for k, teacher in enumerate(self.teachers.values()):
+            deviation = teacher.replay.observation.std(0, dtype=float)
+            scales[0, :len(deviation), k] = 1 / np.maximum(deviation, 0.01)
+        return optimizer, Multitask(sizes, {**optimizer.params, SCALES: scales}, self.dims)
 
     def draw(self, number, part, size):
         """As Distiller's, of one task, padded; NaN: the parts of agents that it lacks."""
@@ -186,7 +201,7 @@ class MultitaskDistiller(fac.Distiller):
         for losses in super().run():
             if self.t in self.saved:
                 fac.check_finite({"weights are": self.optimizer.vector}, self.t, self.config.lr)
-                save(self.saved[self.t], self.student, {"step": self.t})
+                save(self.saved[self.t], self.student, self.header)
             yield losses
 
     def refresh(self):
@@ -238,11 +253,10 @@ def let_play(teacher, task, planning, workers, folder):
     teacher.add(*fac.read_npz(path, ("played",))[1].values())
 
 
-def distil(tasks, config, out, seed=0, centralized=False, data=None, workers=None, marks=()):
-    """Distil a student of the tasks into the folder `out`, or go on there; result.
-
-    marks: shares of the steps after which it is saved, too, as step-N.npz. data: a folder with
-    TASK/expert.npz and replay.npz."""
+def distil(tasks, config, out, seed=0, centralized=False, data=None, workers=None):
+    """Distil a student of the tasks into the folder `out`, or go on there; result. After each of
+    `marked` steps it's saved, too, as step-N.npz. data: a folder with TASK/expert.npz and
+    replay.npz."""
     teachers, plannings, out = {}, {}, Path(out)
     with contextlib.ExitStack() as stack:
         for task in tasks:
@@ -251,13 +265,13 @@ def distil(tasks, config, out, seed=0, centralized=False, data=None, workers=Non
             plannings[task] = fac.PlannerConfig(**fac.made_for(header, path))
             teachers[task] = stack.enter_context(contextlib.closing(fac.Distiller(
                 expert, replay, config, 1 if centralized else None, seed)))
-        saved = {step: out / f"step-{step}.npz" for step in marked(config.steps, marks)}
-        distiller = stack.enter_context(contextlib.closing(MultitaskDistiller(
-            teachers, config, centralized, seed, saved)))
-        stack.enter_context(fac.locked(out))
+        saved = {step: out / f"step-{step}.npz" for step in marked(config.steps)}
         settings = {"of": {task: fac.data_checksums(teacher.expert, teacher.replay)
                            for task, teacher in teachers.items()},
                     "seed": seed, "centralized": centralized, "distill": vars(config)}
+        distiller = stack.enter_context(contextlib.closing(MultitaskDistiller(
+            teachers, config, centralized, seed, saved, settings)))
+        stack.enter_context(fac.locked(out))
         if (path := out / "student.npz").exists():
             before, _ = fac.read_npz(path, ("multitask",))
             fac.same_settings({key: before.get(key) for key in settings}, settings, path)
@@ -282,9 +296,9 @@ def distil(tasks, config, out, seed=0, centralized=False, data=None, workers=Non
             "out": str(out)}
 
 
-def marked(steps, marks):
-    """The steps that these shares of all stand for, at least one each."""
-    return [max(1, round(mark * steps)) for mark in marks]
+def marked(steps):
+    """The steps after which students are saved: MARKS of all."""
+    return [max(1, round(mark * steps)) for mark in MARKS]
 
 
 def read_config(args):
@@ -355,6 +369,228 @@ def command_evaluate(args):
             "kept": fac.return_kept(student_mean, teacher_mean)}
 
 
+# ----------------------------------------------------------------------------------- latents
+
+def latents_of(student, task, data, states, seed):
+    """Latents (N, m, B) of a task's agents in states of its replay's held-out episodes."""
+    replay = fac.Replay((Path(data) / task / "replay.npz") if data else
+                        fac.data_file(task, "replay.npz"))
+    fac.check_task(replay, task, replay.path)
+    _, rows = replay.starts(1, fac.DistillConfig.held_out, seed)
+    rng = fac.stream(seed, "latents of " + task)
+    obs, _ = replay.sequences(rng.choice(rows, states), 1)
+    return student.of_task(task).encode(obs)
+
+
+def stacked(latents):
+    """Latents {task: (N, m, B)} as points (n, m), their joints (n,) and tasks (n,)."""
+    x = np.concatenate([z.swapaxes(1, 2).reshape(-1, z.shape[1]) for z in latents.values()])
+    joints = np.concatenate([np.repeat(np.arange(len(z)), z.shape[2]) for z in latents.values()])
+    tasks = np.repeat([*latents], [z.shape[0] * z.shape[2] for z in latents.values()])
+    return x, joints, tasks
+
+
+def silhouettes(latents, rng):
+    """Of latents {task: (N, m, B)} by joint, by shuffled joints, by task, and by task among the
+    latents of one joint (mean over the joints that all have)."""
+    from sklearn.metrics import silhouette_score
+    x, joints, tasks = stacked(latents)
+    common = range(min(map(len, latents.values())))
+    labels = {"joint": joints, "joints shuffled": rng.permutation(joints), "task": tasks}
+    return {**{name: float(silhouette_score(x, of)) for name, of in labels.items()},
+            "task within a joint": float(np.mean([silhouette_score(
+                x[joints == i], tasks[joints == i]) for i in common]))}
+
+
+def labelled(z, joints):
+    """The latents (n, m) of some joints of z (N, m, B), and 0, 1, ... (n,) for their order."""
+    x = z[list(joints)].swapaxes(1, 2)
+    return x.reshape(-1, z.shape[1]), np.repeat(np.arange(len(joints)), z.shape[2])
+
+
+def recognition(walker, hopper):
+    """Accuracies (chance: 1/3) of a classifier of hip, knee and ankle that learned from one leg's
+    latents (N, m, B): in other states, on another leg, and on the agents of the other robot that
+    have its own slots, whatever they move there."""
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+    found, half = {}, walker.shape[2] // 2
+    right, left = (walker, (0, 1, 2)), (walker, (3, 4, 5))  # hip, knee, ankle
+    leg = (hopper, (1, 2, 3))  # 0 is the waist
+    for name, (z, own), (other, theirs) in (
+            ("walker's right leg, then hopper", right, leg),
+            ("hopper, then walker's right leg", leg, right),
+            ("walker's right leg, then its left", right, left)):
+        classifier = make_pipeline(StandardScaler(), LogisticRegression(max_iter=1000))
+        classifier.fit(*labelled(z[:, :, :half], own))
+        found[name] = {of: float(classifier.score(*labelled(points, joints)))
+                       for of, points, joints in (("itself", z[:, :, half:], own),
+                                                  ("other leg", other, theirs),
+                                                  ("same slots there", other[:, :, half:], own))}
+    return found
+
+
+def draw_latents(path, panels, title):
+    """A panel for each {name: (points (n, 2), joints (n,), tasks (n,))}: colours for joints,
+    markers for tasks."""
+    plt = fac.pyplot()
+    figure, axes = plt.subplots(1, len(panels), figsize=(5.5 * len(panels), 4.8),
+                                layout="constrained", squeeze=False)
+    for ax, (name, (points, joints, tasks)) in zip(axes[0], panels.items()):
+        for k, task in enumerate(dict.fromkeys(tasks)):
+            for j in np.unique(joints[tasks == task]):
+                ax.scatter(*points[(tasks == task) & (joints == j)].T, s=9, alpha=0.7,
+                           color=f"C{j}", marker="o^sD"[k % 4], label=f"{task}, joint {j}")
+        ax.set(title=name, xticks=[], yticks=[])
+        ax.legend(fontsize=6, ncols=len(set(tasks)), loc="upper center", bbox_to_anchor=(0.5, 0))
+    figure.suptitle(title)
+    fac.save_figure(path, figure)
+
+
+def look_into(student, data, points, seed, picture=None):
+    """Silhouettes of the walkers' tasks and of walker and hopper, as far as the student knows them,
+    and `recognition`; a picture of both by t-SNE, if a path for it is given."""
+    with fac.optional("scikit-learn", "experiments"):
+        import sklearn  # noqa: F401
+    walkers = [task for task in student.dims if task.startswith("walker-")]
+    hoppers = [task for task in student.dims if task.startswith("hopper-")]
+    fac.need(walkers and len(walkers + hoppers) > 1, "expected a student of two of walker's tasks, "
+             f"or of one and one of hopper's, found {', '.join(student.dims)}")
+    groups = {"walker, task by task": walkers[:len(walkers) > 1 and 3],
+              "walker and hopper": (walkers[:1] + hoppers[:1]) * bool(hoppers)}
+    found, panels = {}, {}
+    for name, tasks in groups.items():
+        if tasks:
+            latents = {task: latents_of(student, task, data, points, seed) for task in tasks}
+            found[name] = silhouettes(latents, fac.stream(seed, "shuffled joints"))
+            if picture:
+                x, *labels = stacked(latents)
+                panels[name] = (look.t_sne(x), *labels)
+    if hoppers:
+        found["recognition"] = recognition(*(latents_of(student, task, data, 1000, seed)
+                                             for task in (walkers[0], hoppers[0])))
+    if picture:
+        draw_latents(picture, panels, "latents by t-SNE")
+    return found
+
+
+def print_latents(found):
+    """Tables of what `look_into` found."""
+    groups = {name: of for name, of in found.items() if name != "recognition"}
+    for rows in (groups, found.get("recognition")):
+        if rows:
+            heads = [*next(iter(rows.values()))]
+            title = "silhouette by" if rows is groups else "accuracy, chance 0.33"
+            fac.print_table([(title, *heads), *(
+                (name, *(f"{of[head]:.2f}" for head in heads)) for name, of in rows.items())])
+
+
+def command_latents(args):
+    """latents: do agents' latents cluster by joint, and meet across tasks and robots?"""
+    student, header = load(args.model)
+    look.pyplot_for(args.out)
+    found = look_into(student, args.data, args.points, header.get("seed", 0), args.out)
+    print_latents(found)
+    print(args.out)
+    return {**found, "out": args.out}
+
+
+# --------------------------------------------------------------------------------- Figure 10
+
+CASES = {"Fac-TDMPC": False, "TD-MPC": True}  # centralized?
+AROUND = ", around the policy"
+
+
+def play_marks(task, seed, case, settings, folder):
+    """Rows of a task's returns: of a student after each mark's steps, or of its teacher, or its
+    teacher's policy alone."""
+    expert, header, path = load_expert(task, None)
+    episodes, steps = settings["episodes"], settings["steps"]
+    if case == "teacher":
+        yield experiments.of_returns(recorded(expert, header, path, episodes, 0), 0)
+    elif case == "policy":
+        planning = fac.PlannerConfig(**{**fac.made_for(header, path), "prior": "policy",
+                                        "iterations": 0})
+        yield experiments.measure(expert, task, planning, episodes)
+    else:
+        planning = fac.PlannerConfig(**planning_for(header, path, settings["horizon"],
+                                                    case.endswith(AROUND)))
+        for step in marked(steps):
+            student, _ = load(student_folder(folder, seed, case) / f"step-{step}.npz")
+            yield {"step": step, **experiments.measure(student.of_task(task, expert), task,
+                                                       planning, episodes)}
+
+
+def student_folder(folder, seed, case):
+    """Where figure10 leaves a student."""
+    return Path(folder) / f"{seed}" / case.removesuffix(AROUND)
+
+
+def over_tasks(rows, tasks):
+    """`experiments.curves` of runs, and before them the mean over tasks, seed by seed."""
+    found = experiments.curves(rows)
+    cases = found[tasks[0]]
+    mean = {case: {step: np.mean([found[task][case][step] for task in tasks], 0).tolist()
+                   for step in points} for case, points in cases.items()}
+    return {f"mean of {len(tasks)} tasks": mean, **{task: found[task] for task in tasks}}
+
+
+def command_figure10(args):
+    """figure10: returns against steps of both students, teachers' beside; latents."""
+    args.tasks, config = task_list(args), read_config(args)
+    look.pyplot_for(args.picture)
+    with fac.optional("scikit-learn and joblib", "experiments"):
+        import joblib  # noqa: F401
+        import sklearn  # noqa: F401
+    for seed, (case, centralized) in itertools.product(args.seeds, CASES.items()):
+        with contextlib.redirect_stdout(sys.stderr):
+            distil(args.tasks, config, student_folder(args.students, seed, case), seed,
+                   centralized, None, args.workers)
+    of = experiments.crc(config, args.tasks, [experiments.data_checksums(task)
+                                              for task in args.tasks])
+    runs = [experiments.make_run(task, seed, case, made=of, steps=config.steps,
+                                 horizon=config.horizon, episodes=args.episodes)
+            for task in args.tasks for seed, cases in (
+                *((seed, [case + prior for case in CASES for prior in ("", AROUND)])
+                  for seed in args.seeds), (0, ["teacher", "policy"])) for case in cases]
+    result = experiments.run_all(args, functools.partial(play_marks, folder=args.students), runs)
+    fac.need(not result["failed"], f"{result['out']}: {result['failed']} runs failed")
+    keys = {experiments.key_of(run) for run in runs}
+    rows = {key: own for key, own in experiments.finished(
+        experiments.read_rows(result["out"])).items() if key in keys}
+    levels = {(task, case): float(own[-1]["return_mean"]) for (task, _, case, _), own in
+              rows.items() if case in ("teacher", "policy")}
+    found = over_tasks({key: own for key, own in rows.items() if key[2] not in (
+        "teacher", "policy")}, args.tasks)
+    level = {case: {title: levels[title, case] if title in args.tasks else
+                    float(np.mean([levels[task, case] for task in args.tasks]))
+                    for title in found} for case in ("teacher", "policy")}
+    experiments.draw_lines(args.picture, {title: (curves, level["teacher"][title])
+                                          for title, curves in found.items()}, "gradient step")
+    print_figure10(found, level)
+    latents = {}
+    for seed in args.seeds:
+        student, _ = load(student_folder(args.students, seed, "Fac-TDMPC") / "student.npz")
+        with contextlib.suppress(LookupError):
+            latents[seed] = look_into(student, None, 100, seed, Path(args.picture).with_name(
+                f"{Path(args.picture).stem}-latents.png") if seed == args.seeds[0] else None)
+        print_latents(latents[seed])
+    return {**result, "returns": found, "levels": level, "latents": latents,
+            "picture": args.picture}
+
+
+def print_figure10(found, level):
+    """A table for the mean and for each task: each student after each mark's steps."""
+    for title, cases in found.items():
+        steps = [*next(iter(cases.values()))]
+        fac.print_table([(title, *(f"{step:,.0f} steps" for step in steps)), *(
+            (case, *(experiments.cell(experiments.last({step: points[step]}, None))
+                     for step in steps)) for case, points in cases.items()), *(
+            (case, *[""] * (len(steps) - 1), f"{of[title]:.0f}") for case, of in level.items())])
+        print()
+
+
 # ------------------------------------------------------------------------------ command line
 
 def make_parser():
@@ -390,6 +626,15 @@ def make_parser():
     sub.add_argument("--episodes", type=positive, default=20, help="of each task [20]")
     fac.add_config(sub, fac.PlannerConfig, skip=("action_repeat", "horizon"),
                    **fac.STUDENT_PLANNING)
+    sub = fac.add_command(
+        commands, "latents", command_latents, "Figure 10, middle and right: t-SNE of the walkers' "
+        "latents, and of walker's and hopper's, by joint; silhouettes; a classifier of hip, knee "
+        "and ankle that learned from one robot, tried on the other.")
+    sub.add_argument("--model", required=True, help="a student.npz of distill, or a step-N.npz")
+    sub.add_argument("--data", help="folder with TASK/replay.npz [data]")
+    sub.add_argument("--points", type=functools.partial(fac.natural, least=20), default=100,
+                     help="states of each task [%(default)s]")
+    sub.add_argument("--out", default="latents.png", help="the picture [%(default)s]")
     return parser
 
 

@@ -49,7 +49,7 @@ def distiller_of(data, tasks=tuple(ROBOTS), config=CONFIG, centralized=False, se
 def in_float64(student):
     """A copy in double precision, whose last layers aren't zero."""
     rng = np.random.default_rng(3)
-    params = {key: value + 0.1 * rng.standard_normal(value.shape)
+    params = {key: value + 0.1 * rng.standard_normal(value.shape) * (key != multitask.SCALES)
               for key, value in student.params.items()}
     return multitask.Multitask(student.config, params, student.dims)
 
@@ -62,7 +62,8 @@ def loss_of(student, batch, grads=None, loss=multitask.MultitaskDistiller.loss):
 
 
 def gradients(student, batch):
-    grads = {key: np.zeros_like(value) for key, value in student.params.items()}
+    grads = {key: np.zeros_like(value) for key, value in student.params.items()
+             if key != multitask.SCALES}
     loss_of(student, batch, grads)
     return grads
 
@@ -94,6 +95,8 @@ def test_agents_that_a_robot_lacks_change_nothing(data, task):
     own = student.of_task(task)
     m = student.config.latent_dim
     for key, value in student.params.items():  # what only absent agents, other tasks have
+        if key == multitask.SCALES:
+            continue
         if key == multitask.TASKS:
             value[..., [k for k in range(3) if k != number]] += 1
             assert not np.delete(grads[key], number, 2).any() and grads[key][..., number].any()
@@ -198,7 +201,11 @@ def test_two_robots_end_to_end(data, student):
     model, header = multitask.load(folder / "two" / "student.npz")
     assert header["distill"]["steps"] == 24 and model.dims == {
         "reacher-hard": (8, 3), "walker-walk": (24, 6)}
+    scales = model.params.pop(multitask.SCALES)
     assert sum(v.size for v in model.params.values()) == found["weights"]
+    for k, task in enumerate(model.dims):
+        rows = fac.Replay(data / task / "replay.npz").observation
+        assert_close(scales[0, :rows.shape[1], k], 1 / rows.std(0, dtype=float), 1e-6)
     with open(folder / "two" / "curve.csv", newline="") as file:
         assert [row["step"] for row in csv.DictReader(file)][-1] == "24"
     budget = ["--samples", "16", "--iterations", "1", "--episodes", "1", "--data", data]
