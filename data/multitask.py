@@ -26,7 +26,7 @@ import numpy as np
 sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
 import experiments  # noqa: E402
 import fac_tdmpc_ref as fac  # noqa: E402
-import look  # noqa: E402
+import latents  # noqa: E402
 
 # ------------------------------------------------------------------------------- the student
 
@@ -151,6 +151,13 @@ def present_kl(student, expert, *settings):
     return fac.soft_kl(*(np.where(lacks, 0, shares) for shares in (student, expert)), *settings)
 
 
+def padded(x, axis, length, value=0):
+    """x with `value` at the end of an axis, up to a length."""
+    widths = np.zeros((x.ndim, 2), int)
+    widths[axis, 1] = length - x.shape[axis]
+    return np.pad(x, widths, constant_values=value)
+
+
 class MultitaskDistiller(fac.Distiller):
     """Algorithm 1 with teachers {task: Distiller}, each of which draws its own task's states and
     has what its expert predicts there. saved: {step: path} of files written on the way, with a
@@ -180,16 +187,13 @@ class MultitaskDistiller(fac.Distiller):
 
     def draw(self, number, part, size):
         """As Distiller's, of one task, padded; NaN: the parts of agents that it lacks."""
-        task = [*self.teachers][k := (number + part) % len(self.teachers)]
+        task = [*self.dims][k := (number + part) % len(self.dims)]
         features, actions, targets = self.teachers[task].draw(number, part, size)
-        (dim_obs, dim_action), sizes = self.dims[task], self.student.config
-        above = len(self.dims)
-        x = np.pad(features, ((0, 0), (0, sizes.dim_obs - EMBEDDING - dim_obs + above), (0, 0)))
-        x[:, k - above] = 1
-        actions = np.pad(actions, ((0, 0), (0, sizes.dim_action - dim_action), (0, 0), (0, 0)))
-        lacking = sizes.num_agents - len(targets[0])
-        return x, actions, [np.pad(target, ((0, lacking), *[(0, 0)] * 3), constant_values=np.nan)
-                            for target in targets]
+        sizes, one_hot = self.student.config, np.zeros((1, len(self.dims), size), fac.F32)
+        one_hot[:, k] = 1
+        x = np.concatenate([padded(features, 1, sizes.dim_obs - EMBEDDING), one_hot], 1)
+        return x, padded(actions, 1, sizes.dim_action), [
+            padded(target, 0, sizes.num_agents, np.nan) for target in targets]
 
     def step(self):
         """As Distiller's; then embeddings longer than 1 are shortened to 1, as TD-MPC2 does."""
@@ -217,26 +221,30 @@ class MultitaskDistiller(fac.Distiller):
                         for teacher in self.teachers.values()], 0)
 
 
+def named(tasks):
+    """The tasks that --tasks names, between spaces or commas; UserError: unknown, or twice."""
+    found = [task for text in tasks for task in text.split(",")]
+    for task in found:
+        fac.lookup_task(task)
+        fac.need(found.count(task) == 1, f"--tasks: {task} is there twice")
+    return found
+
+
 def small_tasks():
     """The tasks in data/ whose robots have at most MOST_ACTIONS action dimensions."""
     found = sorted(path.parent.name for path in fac.DATA.glob("*/expert.npz"))
+    fac.need(found, f"{fac.DATA}: holds no experts; name --data and --tasks")
     return [task for task in found if fac.lookup_task(task)[3] <= MOST_ACTIONS]
 
 
-def task_list(args):
-    """The tasks of --tasks, or `small_tasks`; UserError: one is unknown, or twice there."""
-    tasks = [task for text in args.tasks for task in text.split(",")] or small_tasks()
-    for task in tasks:
-        fac.lookup_task(task)
-        fac.need(tasks.count(task) == 1, f"--tasks: {task} is there twice")
-    fac.need(tasks, f"{fac.DATA}: no expert of at most {MOST_ACTIONS} action dimensions; name "
-             "--data and --tasks")
-    return tasks
+def load_path(task, data, name):
+    """The path of a task's file in data/, or in the folder `data`."""
+    return Path(data) / task / name if data else fac.data_file(task, name)
 
 
 def load_expert(task, data):
-    """(expert, header, path) of a task in data/, or in the folder `data`."""
-    path = Path(data) / task / "expert.npz" if data else fac.data_file(task, "expert.npz")
+    """(expert, header, path) of a task."""
+    path = load_path(task, data, "expert.npz")
     return *fac.load_model(path, ["expert"]), path
 
 
@@ -302,32 +310,26 @@ def marked(steps):
 
 
 def read_config(args):
-    """The DistillConfig that the flags give: a single task's steps for each."""
-    steps = fac.DistillConfig.steps * len(task_list(args))
-    return fac.from_args(fac.DistillConfig, args, steps=steps, encoder_input="observation")
+    """The DistillConfig that the flags give; by default with a single student's steps a task."""
+    return fac.from_args(fac.DistillConfig, args, encoder_input="observation",
+                         steps=fac.DistillConfig.steps * len(args.tasks))
 
 
 def command_distill(args):
     """distill: one student of many tasks."""
-    config = read_config(args)
+    args.tasks = named(args.tasks) or small_tasks()
     name = "multitask-centralized" if args.centralized else "multitask"
-    result = distil(task_list(args), config, args.out or f"runs/{name}-{args.seed}", args.seed,
-                    args.centralized, args.data, args.workers)
-    fac.print_table([("task", *(f"rank correlation of G, H = {h}" for h in range(
-        config.horizon + 1))), *((task, *(f"{x:.2f}" for x in ranks)) for task, ranks in
-                                 result["rank_correlation_returns"].items())])
+    result = distil(args.tasks, read_config(args), args.out or f"runs/{name}-{args.seed}",
+                    args.seed, args.centralized, args.data, args.workers)
+    ranks = result["rank_correlation_returns"]
+    fac.print_table([("rank correlation of G", *(f"H = {h}" for h in range(
+        len(ranks[args.tasks[0]])))), *((task, *(f"{x:.2f}" for x in own))
+                                        for task, own in ranks.items())])
     print(f"{result['out']}/student.npz, distilled in {result['seconds']:.0f} s")
     return result
 
 
 # ---------------------------------------------------------------------------------- evaluate
-
-def planning_for(header, path, horizon, around=True):
-    """How a task's student plans, as settings of a PlannerConfig: around its teacher's policy, or
-    from nothing as any model."""
-    return {**fac.made_for(header, path), **(fac.STUDENT_PLANNING if around else {}),
-            "horizon": horizon}
-
 
 def recorded(expert, header, path, episodes, seed):
     """The returns of an expert's episodes: those in its record; else measured, in this process."""
@@ -340,158 +342,53 @@ def recorded(expert, header, path, episodes, seed):
 def command_evaluate(args):
     """evaluate: a multi-task student's returns in each of its tasks, beside its teachers'."""
     student, header = load(args.model)
-    settings = header.get("distill") or {}
-    horizon = fac.from_dict(fac.DistillConfig, settings, f"{args.model}: header: distill").horizon
-    tasks = [task for text in args.tasks for task in text.split(",")] or [*student.dims]
+    config = fac.from_dict(fac.DistillConfig, header.get("distill"), f"{args.model}: distill")
     around, found = getattr(args, "PlannerConfig.prior") != "none", {}
-    for task in tasks:
+    for task in named(args.tasks) or student.dims:
         fac.need(task in student.dims, f"--tasks: {task}: {args.model} is of "
                  f"{', '.join(student.dims)}")
         expert, own, path = load_expert(task, args.data)
-        fac.check_task(expert.config, task, path)
-        planning = fac.from_args(fac.PlannerConfig, args, **planning_for(
-            own, path, horizon, around))
+        fac.need(fac.checksum(expert.params.values()) == header["of"][task][0], f"{path}: another "
+                 f"expert than {args.model} was distilled from; name its folder with --data")
+        planning = fac.from_args(fac.PlannerConfig, args, **{
+            **fac.made_for(own, path), "horizon": config.horizon,
+            **(fac.STUDENT_PLANNING if around else {})})
         found[task] = fac.evaluate(student.of_task(task, expert), task, planning, args.episodes,
                                    args.seed, args.workers, task)
         found[task]["teacher_returns"] = recorded(expert, own, path, args.episodes, args.seed)
-    means = np.array([[np.mean(of["returns"]), np.mean(of["teacher_returns"])]
-                      for of in found.values()])
-    rows = [(task, *mean, np.std(of["returns"]), of["plan_ms_median"])
-            for (task, of), mean in zip(found.items(), means)]
-    rows.append(("mean", *means.mean(0), np.nan, np.mean([row[-1] for row in rows])))
+    rows = [[np.mean(of["returns"]), np.std(of["returns"]), np.mean(of["teacher_returns"]),
+             of["plan_ms_median"]] for of in found.values()]
+    means = np.mean(rows, 0).tolist()
     fac.print_table([("task", "student", "teacher", "kept", "ms a decision"), *(
-        (task, f"{mean:.0f}" + ("" if np.isnan(std) else f" ± {std:.0f}"), f"{teacher:.0f}",
-         f"{mean / max(teacher, 1e-9):.2f}", f"{ms:.1f}")
-        for task, mean, teacher, std, ms in rows)])
-    student_mean, teacher_mean = means.mean(0).tolist()
-    return {"tasks": found, "episodes": args.episodes, "seed": args.seed,
-            "return_mean": student_mean, "teacher_mean": teacher_mean,
-            "kept": fac.return_kept(student_mean, teacher_mean)}
+        (task, f"{mean:.0f} ± {std:.0f}", f"{teacher:.0f}", f"{mean / max(teacher, 1e-9):.2f}",
+         f"{ms:.1f}") for task, (mean, std, teacher, ms) in zip([*found, "mean"], [*rows, means]))])
+    return {"tasks": found, "episodes": args.episodes, "seed": args.seed, "return_mean": means[0],
+            "teacher_mean": means[2], "kept": fac.return_kept(means[0], means[2])}
 
 
 # ----------------------------------------------------------------------------------- latents
 
-def latents_of(student, task, data, states, seed):
+def latents_of(student, data, seed, task, states):
     """Latents (N, m, B) of a task's agents in states of its replay's held-out episodes."""
-    replay = fac.Replay((Path(data) / task / "replay.npz") if data else
-                        fac.data_file(task, "replay.npz"))
+    replay = fac.Replay(load_path(task, data, "replay.npz"))
     fac.check_task(replay, task, replay.path)
     _, rows = replay.starts(1, fac.DistillConfig.held_out, seed)
     rng = fac.stream(seed, "latents of " + task)
-    obs, _ = replay.sequences(rng.choice(rows, states), 1)
+    obs, _ = replay.sequences(rng.permutation(rows)[:states], 1)
     return student.of_task(task).encode(obs)
-
-
-def stacked(latents):
-    """Latents {task: (N, m, B)} as points (n, m), their joints (n,) and tasks (n,)."""
-    x = np.concatenate([z.swapaxes(1, 2).reshape(-1, z.shape[1]) for z in latents.values()])
-    joints = np.concatenate([np.repeat(np.arange(len(z)), z.shape[2]) for z in latents.values()])
-    tasks = np.repeat([*latents], [z.shape[0] * z.shape[2] for z in latents.values()])
-    return x, joints, tasks
-
-
-def silhouettes(latents, rng):
-    """Of latents {task: (N, m, B)} by joint, by shuffled joints, by task, and by task among the
-    latents of one joint (mean over the joints that all have)."""
-    from sklearn.metrics import silhouette_score
-    x, joints, tasks = stacked(latents)
-    common = range(min(map(len, latents.values())))
-    labels = {"joint": joints, "joints shuffled": rng.permutation(joints), "task": tasks}
-    return {**{name: float(silhouette_score(x, of)) for name, of in labels.items()},
-            "task within a joint": float(np.mean([silhouette_score(
-                x[joints == i], tasks[joints == i]) for i in common]))}
-
-
-def labelled(z, joints):
-    """The latents (n, m) of some joints of z (N, m, B), and 0, 1, ... (n,) for their order."""
-    x = z[list(joints)].swapaxes(1, 2)
-    return x.reshape(-1, z.shape[1]), np.repeat(np.arange(len(joints)), z.shape[2])
-
-
-def recognition(walker, hopper):
-    """Accuracies (chance: 1/3) of a classifier of hip, knee and ankle that learned from one leg's
-    latents (N, m, B): in other states, on another leg, and on the agents of the other robot that
-    have its own slots, whatever they move there."""
-    from sklearn.linear_model import LogisticRegression
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
-    found, half = {}, walker.shape[2] // 2
-    right, left = (walker, (0, 1, 2)), (walker, (3, 4, 5))  # hip, knee, ankle
-    leg = (hopper, (1, 2, 3))  # 0 is the waist
-    for name, (z, own), (other, theirs) in (
-            ("walker's right leg, then hopper", right, leg),
-            ("hopper, then walker's right leg", leg, right),
-            ("walker's right leg, then its left", right, left)):
-        classifier = make_pipeline(StandardScaler(), LogisticRegression(max_iter=1000))
-        classifier.fit(*labelled(z[:, :, :half], own))
-        found[name] = {of: float(classifier.score(*labelled(points, joints)))
-                       for of, points, joints in (("itself", z[:, :, half:], own),
-                                                  ("other leg", other, theirs),
-                                                  ("same slots there", other[:, :, half:], own))}
-    return found
-
-
-def draw_latents(path, panels, title):
-    """A panel for each {name: (points (n, 2), joints (n,), tasks (n,))}: colours for joints,
-    markers for tasks."""
-    plt = fac.pyplot()
-    figure, axes = plt.subplots(1, len(panels), figsize=(5.5 * len(panels), 4.8),
-                                layout="constrained", squeeze=False)
-    for ax, (name, (points, joints, tasks)) in zip(axes[0], panels.items()):
-        for k, task in enumerate(dict.fromkeys(tasks)):
-            for j in np.unique(joints[tasks == task]):
-                ax.scatter(*points[(tasks == task) & (joints == j)].T, s=9, alpha=0.7,
-                           color=f"C{j}", marker="o^sD"[k % 4], label=f"{task}, joint {j}")
-        ax.set(title=name, xticks=[], yticks=[])
-        ax.legend(fontsize=6, ncols=len(set(tasks)), loc="upper center", bbox_to_anchor=(0.5, 0))
-    figure.suptitle(title)
-    fac.save_figure(path, figure)
-
-
-def look_into(student, data, points, seed, picture=None):
-    """Silhouettes of the walkers' tasks and of walker and hopper, as far as the student knows them,
-    and `recognition`; a picture of both by t-SNE, if a path for it is given."""
-    with fac.optional("scikit-learn", "experiments"):
-        import sklearn  # noqa: F401
-    walkers = [task for task in student.dims if task.startswith("walker-")]
-    hoppers = [task for task in student.dims if task.startswith("hopper-")]
-    fac.need(walkers and len(walkers + hoppers) > 1, "expected a student of two of walker's tasks, "
-             f"or of one and one of hopper's, found {', '.join(student.dims)}")
-    groups = {"walker, task by task": walkers[:len(walkers) > 1 and 3],
-              "walker and hopper": (walkers[:1] + hoppers[:1]) * bool(hoppers)}
-    found, panels = {}, {}
-    for name, tasks in groups.items():
-        if tasks:
-            latents = {task: latents_of(student, task, data, points, seed) for task in tasks}
-            found[name] = silhouettes(latents, fac.stream(seed, "shuffled joints"))
-            if picture:
-                x, *labels = stacked(latents)
-                panels[name] = (look.t_sne(x), *labels)
-    if hoppers:
-        found["recognition"] = recognition(*(latents_of(student, task, data, 1000, seed)
-                                             for task in (walkers[0], hoppers[0])))
-    if picture:
-        draw_latents(picture, panels, "latents by t-SNE")
-    return found
-
-
-def print_latents(found):
-    """Tables of what `look_into` found."""
-    groups = {name: of for name, of in found.items() if name != "recognition"}
-    for rows in (groups, found.get("recognition")):
-        if rows:
-            heads = [*next(iter(rows.values()))]
-            title = "silhouette by" if rows is groups else "accuracy, chance 0.33"
-            fac.print_table([(title, *heads), *(
-                (name, *(f"{of[head]:.2f}" for head in heads)) for name, of in rows.items())])
 
 
 def command_latents(args):
     """latents: do agents' latents cluster by joint, and meet across tasks and robots?"""
     student, header = load(args.model)
-    look.pyplot_for(args.out)
-    found = look_into(student, args.data, args.points, header.get("seed", 0), args.out)
-    print_latents(found)
+    latents.need_plots(args.out)
+    fac.need(latents.comparisons(student.dims) and student.config.num_agents > 1, f"{args.model}: "
+             "expected a factored student of two walker tasks, or of one and one of hopper, found "
+             f"{student.config.num_agents} agents, {', '.join(student.dims)}")
+    seed = header.get("seed", 0)
+    found = latents.compare(functools.partial(latents_of, student, args.data, seed), student.dims,
+                            args.points, seed, args.out)
+    latents.print_tables(found)
     print(args.out)
     return {**found, "out": args.out}
 
@@ -500,22 +397,24 @@ def command_latents(args):
 
 CASES = {"Fac-TDMPC": False, "TD-MPC": True}  # centralized?
 AROUND = ", around the policy"
+TEACHER, POLICY = "teacher", "its policy alone"
 
 
-def play_marks(task, seed, case, settings, folder):
-    """Rows of a task's returns: of a student after each mark's steps, or of its teacher, or its
-    teacher's policy alone."""
-    expert, header, path = load_expert(task, None)
+def play_marks(task, seed, case, settings, folder, data):
+    """Rows of a task's returns: of a student after each of `marked` steps, planning alone or around
+    its teacher's policy; or of the teacher; or of its policy alone."""
+    expert, header, path = load_expert(task, data)
     episodes, steps = settings["episodes"], settings["steps"]
-    if case == "teacher":
-        yield experiments.of_returns(recorded(expert, header, path, episodes, 0), 0)
-    elif case == "policy":
-        planning = fac.PlannerConfig(**{**fac.made_for(header, path), "prior": "policy",
-                                        "iterations": 0})
-        yield experiments.measure(expert, task, planning, episodes)
+    own = fac.made_for(header, path)
+    if case == TEACHER:
+        returns = recorded(expert, header, path, episodes, 0)
+        yield {"step": steps, **experiments.of_returns(returns, 0)}
+    elif case == POLICY:
+        planning = fac.PlannerConfig(**{**own, "prior": "policy", "iterations": 0})
+        yield {"step": steps, **experiments.measure(expert, task, planning, episodes)}
     else:
-        planning = fac.PlannerConfig(**planning_for(header, path, settings["horizon"],
-                                                    case.endswith(AROUND)))
+        planning = fac.PlannerConfig(**{**own, "horizon": settings["horizon"], **(
+            fac.STUDENT_PLANNING if case.endswith(AROUND) else {})})
         for step in marked(steps):
             student, _ = load(student_folder(folder, seed, case) / f"step-{step}.npz")
             yield {"step": step, **experiments.measure(student.of_task(task, expert), task,
@@ -530,64 +429,58 @@ def student_folder(folder, seed, case):
 def over_tasks(rows, tasks):
     """`experiments.curves` of runs, and before them the mean over tasks, seed by seed."""
     found = experiments.curves(rows)
-    cases = found[tasks[0]]
     mean = {case: {step: np.mean([found[task][case][step] for task in tasks], 0).tolist()
-                   for step in points} for case, points in cases.items()}
+                   for step in points} for case, points in found[tasks[0]].items()}
     return {f"mean of {len(tasks)} tasks": mean, **{task: found[task] for task in tasks}}
+
+
+def figure10_runs(args, config, made):
+    """A run for each task, seed and case. made: a number that tells students apart."""
+    cases = [(seed, case + prior) for seed in args.seeds for case in CASES
+             for prior in ("", AROUND)]
+    return [experiments.make_run(task, seed, case, made=made, steps=config.steps,
+                                 horizon=config.horizon, episodes=args.episodes)
+            for task in args.tasks for seed, case in (*cases, (0, TEACHER), (0, POLICY))]
 
 
 def command_figure10(args):
     """figure10: returns against steps of both students, teachers' beside; latents."""
-    args.tasks, config = task_list(args), read_config(args)
-    look.pyplot_for(args.picture)
-    with fac.optional("scikit-learn and joblib", "experiments"):
-        import joblib  # noqa: F401
-        import sklearn  # noqa: F401
+    args.tasks = named(args.tasks) or small_tasks()
+    config = read_config(args)
+    latents.need_plots(args.picture)
     for seed, (case, centralized) in itertools.product(args.seeds, CASES.items()):
         with contextlib.redirect_stdout(sys.stderr):
             distil(args.tasks, config, student_folder(args.students, seed, case), seed,
-                   centralized, None, args.workers)
-    of = experiments.crc(config, args.tasks, [experiments.data_checksums(task)
-                                              for task in args.tasks])
-    runs = [experiments.make_run(task, seed, case, made=of, steps=config.steps,
-                                 horizon=config.horizon, episodes=args.episodes)
-            for task in args.tasks for seed, cases in (
-                *((seed, [case + prior for case in CASES for prior in ("", AROUND)])
-                  for seed in args.seeds), (0, ["teacher", "policy"])) for case in cases]
-    result = experiments.run_all(args, functools.partial(play_marks, folder=args.students), runs)
+                   centralized, args.data, args.workers)
+    students = {seed: load(student_folder(args.students, seed, "Fac-TDMPC") / "student.npz")
+                for seed in args.seeds}
+    made = experiments.crc(config, students[args.seeds[0]][1]["of"])
+    runs = figure10_runs(args, config, made)
+    result = experiments.run_all(args, functools.partial(
+        play_marks, folder=args.students, data=args.data), runs)
     fac.need(not result["failed"], f"{result['out']}: {result['failed']} runs failed")
-    keys = {experiments.key_of(run) for run in runs}
-    rows = {key: own for key, own in experiments.finished(
-        experiments.read_rows(result["out"])).items() if key in keys}
-    levels = {(task, case): float(own[-1]["return_mean"]) for (task, _, case, _), own in
-              rows.items() if case in ("teacher", "policy")}
-    found = over_tasks({key: own for key, own in rows.items() if key[2] not in (
-        "teacher", "policy")}, args.tasks)
-    level = {case: {title: levels[title, case] if title in args.tasks else
-                    float(np.mean([levels[task, case] for task in args.tasks]))
-                    for title in found} for case in ("teacher", "policy")}
-    experiments.draw_lines(args.picture, {title: (curves, level["teacher"][title])
-                                          for title, curves in found.items()}, "gradient step")
-    print_figure10(found, level)
-    latents = {}
-    for seed in args.seeds:
-        student, _ = load(student_folder(args.students, seed, "Fac-TDMPC") / "student.npz")
-        with contextlib.suppress(LookupError):
-            latents[seed] = look_into(student, None, 100, seed, Path(args.picture).with_name(
-                f"{Path(args.picture).stem}-latents.png") if seed == args.seeds[0] else None)
-        print_latents(latents[seed])
-    return {**result, "returns": found, "levels": level, "latents": latents,
-            "picture": args.picture}
+    done = experiments.finished(experiments.read_rows(result["out"]))
+    found = over_tasks({key: done[key] for key in map(experiments.key_of, runs)}, args.tasks)
+    experiments.draw_lines(args.picture, {
+        title: (cases, cases[TEACHER][config.steps][0]) for title, cases in found.items()},
+        "gradient step")
+    print_figure10(found, marked(config.steps))
+    compared, picture = {}, Path(args.picture).with_name(f"{Path(args.picture).stem}-latents.png")
+    for seed, (student, _) in students.items():
+        compared[seed] = latents.compare(functools.partial(
+            latents_of, student, args.data, seed), student.dims, 100, seed,
+            None if compared else picture)
+        latents.print_tables(compared[seed])
+    return {**result, "returns": found, "latents": compared, "picture": args.picture}
 
 
-def print_figure10(found, level):
-    """A table for the mean and for each task: each student after each mark's steps."""
+def print_figure10(found, steps):
+    """A table for the mean and for each task: mean returns, over seeds, after these steps."""
     for title, cases in found.items():
-        steps = [*next(iter(cases.values()))]
-        fac.print_table([(title, *(f"{step:,.0f} steps" for step in steps)), *(
-            (case, *(experiments.cell(experiments.last({step: points[step]}, None))
-                     for step in steps)) for case, points in cases.items()), *(
-            (case, *[""] * (len(steps) - 1), f"{of[title]:.0f}") for case, of in level.items())])
+        fac.print_table([(title, *(f"{step:,} steps" for step in steps)), *(
+            (case, *(experiments.cell(experiments.last({step: points[step]}, None)
+                                      if step in points else None) for step in steps))
+            for case, points in cases.items())])
         print()
 
 
@@ -635,6 +528,20 @@ def make_parser():
     sub.add_argument("--points", type=functools.partial(fac.natural, least=20), default=100,
                      help="states of each task [%(default)s]")
     sub.add_argument("--out", default="latents.png", help="the picture [%(default)s]")
+    sub = add("figure10", command_figure10, "Return against steps of the factored student and of "
+              "a centralized one, each planning alone and around its teachers' policies; then "
+              "latents.", epilog="The same command again makes what is missing.")
+    sub.add_argument("--seeds", nargs="+", type=fac.natural, default=[0, 1, 2], metavar="SEED",
+                     help="of distillation [0 1 2]")
+    sub.add_argument("--episodes", type=positive, default=5, help="of each evaluation [5]")
+    sub.add_argument("--jobs", type=positive, default=fac.cores(),
+                     help="tasks that are played at a time [one for each core]")
+    sub.add_argument("--students", default="runs/figure10", help="leave them in SEED/ there "
+                     "[%(default)s]")
+    sub.add_argument("--out", help="the CSV [data/results/figure10.csv]")
+    sub.add_argument("--picture", default=str(fac.DATA / "figures" / "figure10.png"),
+                     help="beside it FIGURE-latents.png [data/figures/figure10.png]")
+    add_distillation(sub)
     return parser
 
 

@@ -11,6 +11,7 @@ import sys
 import numpy as np
 import pytest
 
+import experiments
 import fac_tdmpc_ref as fac
 import multitask
 import test_cli
@@ -297,3 +298,56 @@ def test_a_damaged_file_is_named(student, tmp_path, change, parts):
     with pytest.raises(fac.UserError) as error:
         multitask.load(tmp_path / "odd.npz")
     assert all(part in str(error.value) for part in [*parts, "odd.npz"])
+
+
+@pytest.fixture
+def short_episodes(monkeypatch):
+    """Of 10 decisions; an experiment's runs are made in this process."""
+    def in_this_process(function, runs, _):
+        for run in runs:
+            yield experiments.attempt(function, run, os.getpid())
+
+    monkeypatch.setattr(fac, "CONTROL_STEPS", 20)
+    monkeypatch.setattr(experiments, "in_processes", in_this_process)
+
+
+def figure10(capsys, data, *more):
+    flags = ["--tasks", "walker-walk", "hopper-hop", "--data", str(data), "--steps", "40",
+             "--episodes", "2", "--out", "rows.csv", "--picture", "figure10.png", "--students",
+             "students", "--seeds", "0", "1", *TINY, "--json"]
+    assert multitask.main(["figure10", *flags, *more]) == 0, capsys.readouterr().err
+    out = capsys.readouterr().out
+    return json.loads(out.splitlines()[-1]), out
+
+
+def test_figure_10(data, tmp_path, monkeypatch, capsys, short_episodes):
+    pytest.importorskip("sklearn")
+    monkeypatch.chdir(tmp_path)
+    found, out = figure10(capsys, data)
+    assert (found["runs"], found["now"], found["failed"]) == (20, 20, 0)  # 2 x (2 x 2 x 2 + 2)
+    cases = {f"{case}{prior}" for case in ("Fac-TDMPC", "TD-MPC") for prior in (
+        "", ", around the policy")}
+    returns = found["returns"]
+    assert list(returns) == ["mean of 2 tasks", "walker-walk", "hopper-hop"]
+    for title, of in returns.items():
+        assert set(of) == {*cases, "teacher", "its policy alone"} and title in out
+        assert all({k: len(v) for k, v in of[case].items()} == {
+            "1.0": 2, "4.0": 2, "12.0": 2, "40.0": 2} for case in cases)
+        assert [*of["teacher"]] == [*of["its policy alone"]] == ["40.0"]
+    for case in cases:
+        assert np.allclose(returns["mean of 2 tasks"][case]["12.0"], np.mean([
+            returns[task][case]["12.0"] for task in ("walker-walk", "hopper-hop")], 0))
+    model, _ = multitask.load("students/1/TD-MPC/step-12.npz")
+    expert, header, path = multitask.load_expert("walker-walk", data)
+    planning = fac.PlannerConfig(**fac.STUDENT_PLANNING, **{**fac.made_for(header, path),
+                                                            "horizon": 1})
+    played = fac.play(model.of_task("walker-walk", expert), "walker-walk", planning,
+                      fac.episode_seeds(0, 2), 0)[2].sum(1).mean()
+    assert np.isclose(returns["walker-walk"]["TD-MPC, around the policy"]["12.0"][1], played)
+    assert set(found["latents"]) == {"0", "1"}
+    for name in ("figure10.png", "figure10-latents.png"):
+        assert (tmp_path / name).read_bytes()[:4] == b"\x89PNG"
+    again, _ = figure10(capsys, data)
+    assert again["now"] == 0 and again["returns"] == returns
+    more, _ = figure10(capsys, data, "--lr", "2e-3", "--students", "others", "--seeds", "0")
+    assert more["now"] == 12, "what other students got isn't theirs"
