@@ -114,8 +114,7 @@ def student_sizes(dims, centralized):
 
 def save(path, student, header):
     """A multi-task student's file."""
-    tasks = {task: list(dims) for task, dims in student.dims.items()}
-    fac.write_npz(path, {**header, "kind": "multitask", "tasks": tasks,
+    fac.write_npz(path, {**header, "kind": "multitask", "tasks": student.dims,
                          "model": vars(student.config)}, student.params)
 
 
@@ -123,13 +122,10 @@ def load(path):
     """(Multitask, header) of a file; UserError names what is wrong in it."""
     header, arrays = fac.read_npz(path, ("multitask",))
     config = fac.from_dict(fac.ModelConfig, header.get("model"), f"{path}: header: model")
-    dims = header.get("tasks")
-    fac.need(isinstance(dims, dict) and dims, f"{path}: header: tasks: expected sizes by task, "
-             f"found {dims!r}")
-    for task, found in dims.items():
-        expected = list(fac.lookup_task(task)[2:])
-        fac.need(found == expected, f"{path}: header: tasks: {task}: expected {expected}, found "
-                 f"{found!r}")
+    dims, there = header.get("tasks"), f"{path}: header: tasks"
+    fac.need(isinstance(dims, dict) and dims, f"{there}: expected sizes by task, found {dims!r}")
+    expected = {task: [*fac.lookup_task(task)[2:]] for task in dims}
+    fac.need(dims == expected, f"{there}: expected {expected}, found {dims}")
     shapes = {TASKS: (1, EMBEDDING, len(dims)),
               SCALES: (1, config.dim_obs - EMBEDDING, len(dims))}
     for name, i, _, shape, _ in fac.layers(config):
@@ -139,7 +135,7 @@ def load(path):
         fac.need(value.shape == shapes.get(key) and value.dtype == fac.F32 and
                  np.isfinite(value).all(), f"{path}: {key}: expected finite float32 "
                  f"{shapes.get(key, 'nothing')}, found {value.dtype} {value.shape}")
-    return Multitask(config, arrays, {task: tuple(found) for task, found in dims.items()}), header
+    return Multitask(config, arrays, dims), header
 
 
 # ------------------------------------------------------------------------------ distillation
@@ -261,46 +257,41 @@ def let_play(teacher, task, planning, workers, folder):
     teacher.add(*fac.read_npz(path, ("played",))[1].values())
 
 
-def distil(tasks, config, out, seed=0, centralized=False, data=None, workers=None):
-    """Distil a student of the tasks into the folder `out`, or go on there; result. After each of
-    `marked` steps it's saved, too, as step-N.npz. data: a folder with TASK/expert.npz and
-    replay.npz."""
+def distil(args, config, out, seed, centralized):
+    """Distil a student of args.tasks into the folder `out`, or go on there; result. It's saved
+    after each of `marked` steps, too, as step-N.npz."""
     teachers, plannings, out = {}, {}, Path(out)
     with contextlib.ExitStack() as stack:
-        for task in tasks:
+        for task in args.tasks:
             expert, header, replay, path = fac.load_data(argparse.Namespace(
-                task=task, expert=data and Path(data) / task, replay=None))
+                task=task, expert=args.data and Path(args.data) / task, replay=None))
             plannings[task] = fac.PlannerConfig(**fac.made_for(header, path))
             teachers[task] = stack.enter_context(contextlib.closing(fac.Distiller(
                 expert, replay, config, 1 if centralized else None, seed)))
-        saved = {step: out / f"step-{step}.npz" for step in marked(config.steps)}
-        settings = {"of": {task: fac.data_checksums(teacher.expert, teacher.replay)
-                           for task, teacher in teachers.items()},
-                    "seed": seed, "centralized": centralized, "distill": vars(config)}
+        settings = {"seed": seed, "centralized": centralized, "distill": vars(config), "of": {
+            task: fac.data_checksums(of.expert, of.replay) for task, of in teachers.items()}}
         distiller = stack.enter_context(contextlib.closing(MultitaskDistiller(
-            teachers, config, centralized, seed, saved, settings)))
+            teachers, config, centralized, seed,
+            {step: out / f"step-{step}.npz" for step in marked(config.steps)}, settings)))
         stack.enter_context(fac.locked(out))
         if (path := out / "student.npz").exists():
-            before, _ = fac.read_npz(path, ("multitask",))
+            _, before = load(path)
             fac.same_settings({key: before.get(key) for key in settings}, settings, path)
         for task, teacher in teachers.items():
             if config.expert_episodes:
-                let_play(teacher, task, plannings[task], workers, out.parent / "played")
-        count = len(distiller.optimizer.vector)
-        print(f"{len(tasks)} tasks: {distiller.student.config.num_agents} agents, {count:,} "
-              f"weights; {config.steps:,} steps of {config.batch_size} x {config.noise_samples}; "
-              f"results in {out}", file=sys.stderr)
-        planning = next(iter(plannings.values()))
-        curve, seconds, _ = fac.train_student(distiller, out, settings, planning, workers)
-        save(out / "student.npz", distiller.student, settings)
+                let_play(teacher, task, plannings[task], args.workers, out.parent / "played")
+        agents, count = distiller.student.config.num_agents, len(distiller.optimizer.vector)
+        print(f"{len(teachers)} tasks, {agents} agents, {count:,} weights; {config.steps:,} steps "
+              f"of {config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
+        curve, seconds, _ = fac.train_student(distiller, out, settings,
+                                              plannings[args.tasks[0]], args.workers)
+        save(path, distiller.student, settings)
         distiller.refresh()
-        ranks = {task: fac.rank_results(teacher, 64, plannings[task].discount)
-                 for task, teacher in teachers.items()}
-    return {"tasks": tasks, "seed": seed, "centralized": centralized, "weights": count,
-            "num_agents": distiller.student.config.num_agents, "steps": config.steps,
-            "seconds": round(seconds, 1), "kl_reward": curve[-1][3], "kl_value": curve[-1][4],
-            "rank_correlation_returns": {
-                task: found["rank_correlation_returns"] for task, found in ranks.items()},
+        ranks = {task: fac.rank_results(of, 64, plannings[task].discount)[
+            "rank_correlation_returns"] for task, of in teachers.items()}
+    return {"tasks": args.tasks, "seed": seed, "centralized": centralized, "weights": count,
+            "num_agents": agents, "steps": config.steps, "seconds": round(seconds, 1),
+            "kl_reward": curve[-1][3], "kl_value": curve[-1][4], "rank_correlation_returns": ranks,
             "out": str(out)}
 
 
@@ -319,8 +310,8 @@ def command_distill(args):
     """distill: one student of many tasks."""
     args.tasks = named(args.tasks) or small_tasks()
     name = "multitask-centralized" if args.centralized else "multitask"
-    result = distil(args.tasks, read_config(args), args.out or f"runs/{name}-{args.seed}",
-                    args.seed, args.centralized, args.data, args.workers)
+    result = distil(args, read_config(args), args.out or f"runs/{name}-{args.seed}", args.seed,
+                    args.centralized)
     ranks = result["rank_correlation_returns"]
     fac.print_table([("rank correlation of G", *(f"H = {h}" for h in range(
         len(ranks[args.tasks[0]])))), *((task, *(f"{x:.2f}" for x in own))
@@ -450,8 +441,7 @@ def command_figure10(args):
     latents.need_plots(args.picture)
     for seed, (case, centralized) in itertools.product(args.seeds, CASES.items()):
         with contextlib.redirect_stdout(sys.stderr):
-            distil(args.tasks, config, student_folder(args.students, seed, case), seed,
-                   centralized, args.data, args.workers)
+            distil(args, config, student_folder(args.students, seed, case), seed, centralized)
     students = {seed: load(student_folder(args.students, seed, "Fac-TDMPC") / "student.npz")
                 for seed in args.seeds}
     made = experiments.crc(config, students[args.seeds[0]][1]["of"])
@@ -493,63 +483,57 @@ def make_parser():
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     positive = functools.partial(fac.natural, least=1)
 
-    def add(name, run, help, **about):
+    def add(name, run, help, tasks="", model=False, **about):
         sub = fac.add_command(commands, name, run, help, **about)
-        sub.add_argument("--tasks", nargs="+", default=[], metavar="TASK", help="any of: "
-                         f"{fac.task_names()} [experts in data/ of at most {MOST_ACTIONS} action "
-                         "dimensions; evaluate: the student's]")
+        if tasks:
+            sub.add_argument("--tasks", nargs="+", default=[], metavar="TASK", help="any of: "
+                             f"{fac.task_names()} [{tasks}]")
+            sub.add_argument("--workers", type=fac.natural,
+                             help="processes that play episodes; 0: this one [cores]")
+        if model:
+            sub.add_argument("--model", required=True, help="distill's student.npz or step-N.npz")
+        else:
+            sub.add_argument("--steps", type=int, dest="DistillConfig.steps", metavar="INT", help=
+                             f"gradient steps in all [{fac.DistillConfig.steps} for each task]")
+            fac.add_config(sub, fac.DistillConfig, skip=("steps", "targets", "encoder_input"))
         sub.add_argument("--data", help="folder with TASK/expert.npz and replay.npz [data]")
-        sub.add_argument("--workers", type=fac.natural,
-                         help="processes that play episodes; 0: this one [cores]")
-        return sub
+        return sub.add_argument
 
-    sub = add("distill", command_distill, "Distil many tasks' experts into one student.",
-              epilog="Given again, a cut-off run goes on. The policies' episodes are kept beside "
-              "--out, in played/, for other runs of the same seed.")
-    sub.add_argument("--seed", type=fac.natural, default=0, help="of distillation [0]")
-    sub.add_argument("--centralized", action="store_true", help="one agent, with the same encoder, "
-                     "about as many weights, the same states")
-    sub.add_argument("--out", help="folder for the results [runs/multitask-SEED, "
-                     "runs/multitask-centralized-SEED]")
-    add_distillation(sub)
-    sub = add("evaluate", command_evaluate, "Plan with a student in each of its tasks, by default "
-              "around its teacher's policy; with --prior none it plans alone.")
-    sub.add_argument("--model", required=True, help="a student.npz of distill, or a step-N.npz")
-    sub.add_argument("--seed", type=fac.natural, default=0, help="of the episodes [0]")
-    sub.add_argument("--episodes", type=positive, default=20, help="of each task [20]")
-    fac.add_config(sub, fac.PlannerConfig, skip=("action_repeat", "horizon"),
-                   **fac.STUDENT_PLANNING)
-    sub = fac.add_command(
-        commands, "latents", command_latents, "Figure 10, middle and right: t-SNE of the walkers' "
-        "latents, and of walker's and hopper's, by joint; silhouettes; a classifier of hip, knee "
-        "and ankle that learned from one robot, tried on the other.")
-    sub.add_argument("--model", required=True, help="a student.npz of distill, or a step-N.npz")
-    sub.add_argument("--data", help="folder with TASK/replay.npz [data]")
-    sub.add_argument("--points", type=functools.partial(fac.natural, least=20), default=100,
-                     help="states of each task [%(default)s]")
-    sub.add_argument("--out", default="latents.png", help="the picture [%(default)s]")
-    sub = add("figure10", command_figure10, "Return against steps of the factored student and of "
-              "a centralized one, each planning alone and around its teachers' policies; then "
-              "latents.", epilog="The same command again makes what is missing.")
-    sub.add_argument("--seeds", nargs="+", type=fac.natural, default=[0, 1, 2], metavar="SEED",
-                     help="of distillation [0 1 2]")
-    sub.add_argument("--episodes", type=positive, default=5, help="of each evaluation [5]")
-    sub.add_argument("--jobs", type=positive, default=fac.cores(),
-                     help="tasks that are played at a time [one for each core]")
-    sub.add_argument("--students", default="runs/figure10", help="leave them in SEED/ there "
-                     "[%(default)s]")
-    sub.add_argument("--out", help="the CSV [data/results/figure10.csv]")
-    sub.add_argument("--picture", default=str(fac.DATA / "figures" / "figure10.png"),
-                     help="beside it FIGURE-latents.png [data/figures/figure10.png]")
-    add_distillation(sub)
+    small = f"experts in data/ of at most {MOST_ACTIONS} action dimensions"
+    option = add("distill", command_distill, "Distil many tasks' experts into one student.", small,
+                 epilog="Given again, a cut-off run goes on. What the policies play is kept "
+                 "beside --out, in played/, for other runs of the same seed.")
+    option("--seed", type=fac.natural, default=0, help="of distillation [0]")
+    option("--centralized", action="store_true", help="one agent, with the same encoder, about as "
+           "many weights, the same states")
+    option("--out", help="folder for the results [runs/multitask-SEED, "
+           "runs/multitask-centralized-SEED]")
+    option = add("evaluate", command_evaluate, "Plan with a student in each of its tasks, by "
+                 "default around its teacher's policy; with --prior none it plans alone.",
+                 "the student's", True)
+    option("--seed", type=fac.natural, default=0, help="of the episodes [0]")
+    option("--episodes", type=positive, default=20, help="of each task [20]")
+    fac.add_config(commands.choices["evaluate"], fac.PlannerConfig,
+                   skip=("action_repeat", "horizon"), **fac.STUDENT_PLANNING)
+    option = add("latents", command_latents, "Figure 10, middle and right: t-SNE of the walkers' "
+                 "latents, and of walker's and hopper's, by joint; silhouettes; a classifier of "
+                 "hip, knee and ankle that learned from one robot, tried on the other.", "", True)
+    option("--points", type=functools.partial(fac.natural, least=20), default=100,
+           help="states of each task [%(default)s]")
+    option("--out", default="latents.png", help="the picture [%(default)s]")
+    option = add("figure10", command_figure10, "Return against steps of the factored student and "
+                 "of a centralized one, each planning alone and around its teachers' policies; "
+                 "then latents.", small, epilog="The same command again makes what is missing.")
+    option("--seeds", nargs="+", type=fac.natural, default=[0, 1, 2], metavar="SEED",
+           help="of distillation [0 1 2]")
+    option("--episodes", type=positive, default=5, help="of each evaluation [5]")
+    option("--jobs", type=positive, default=fac.cores(),
+           help="tasks that are played at a time [one for each core]")
+    option("--students", default="runs/figure10", help="leave them in SEED/ there [%(default)s]")
+    option("--out", help="the CSV [data/results/figure10.csv]")
+    option("--picture", default=str(fac.DATA / "figures" / "figure10.png"), help="beside it "
+           "FIGURE-latents.png [data/figures/figure10.png]")
     return parser
-
-
-def add_distillation(sub):
-    """Algorithm 1's flags: what a student of many tasks has no choice of isn't there."""
-    sub.add_argument("--steps", type=int, dest="DistillConfig.steps", metavar="INT",
-                     help=f"gradient steps in all [{fac.DistillConfig.steps} for each task]")
-    fac.add_config(sub, fac.DistillConfig, skip=("steps", "targets", "encoder_input"))
 
 
 def main(argv=None):

@@ -201,7 +201,7 @@ def test_two_robots_end_to_end(data, student):
         "reacher-hard": 2, "walker-walk": 2}
     model, header = multitask.load(folder / "two" / "student.npz")
     assert header["distill"]["steps"] == 24 and model.dims == {
-        "reacher-hard": (8, 3), "walker-walk": (24, 6)}
+        "reacher-hard": [8, 3], "walker-walk": [24, 6]}
     scales = model.params.pop(multitask.SCALES)
     assert sum(v.size for v in model.params.values()) == found["weights"]
     for k, task in enumerate(model.dims):
