@@ -157,23 +157,32 @@ def padded(x, axis, length, value=0):
 class MultitaskDistiller(fac.Distiller):
     """Algorithm 1 with teachers {task: Distiller}, each of which draws its own task's states and
     has what its expert predicts there. saved: {step: path} of files written on the way, with a
-    header."""
+    header. start: a Multitask of the same sizes, whose weights this one's student begins with."""
 
     loss = staticmethod(functools.partial(fac.distill_loss, divergence=present_kl))
 
-    def __init__(self, teachers, config, centralized=False, seed=0, saved=(), header=()):
+    def __init__(self, teachers, config, centralized=False, seed=0, saved=(), header=(),
+                 start=None):
         self.teachers, self.saved, self.header = teachers, dict(saved), dict(header)
-        self.dims = {task: (teacher.replay.dim_obs, teacher.replay.dim_action)
-                     for task, teacher in teachers.items()}
+        self.start, self.dims = start, {
+            task: [of.replay.dim_obs, of.replay.dim_action] for task, of in teachers.items()}
+        sizes = student_sizes({**(start.dims if start else {}), **self.dims}, centralized)
+        fac.need(not start or start.config == sizes, "--start: expected a student for robots as "
+                 f"wide as these, and of as many agents ({sizes}), found {start and start.config}")
         widest = max(teachers.values(), key=lambda teacher: teacher.replay.dim_action)
         super().__init__(widest.expert, widest.replay, dataclasses.replace(
-            config, expert_episodes=0), seed=seed, **vars(student_sizes(self.dims, centralized)))
+            config, expert_episodes=0), seed=seed, **vars(sizes))
         self.pool_size = max(self.pool_size, fac.PART * len(teachers))  # which holds all tasks
 
     def create(self, expert, sizes, seed):
         """(Adam, student): embeddings of norm 1, at right angles, beside fresh weights."""
         _, student = fac.new_student(expert, sizes, seed)
         embedding = fac.orthogonal(fac.stream(seed, "embedding"), 1, EMBEDDING, len(self.dims))
+        if self.start:  # but for the embeddings of tasks that it doesn't know
+            student.params.update({key: self.start.params[key] for key in student.params})
+            for task in set(self.dims) & set(self.start.dims):
+                embedding[..., [*self.dims].index(task)] = self.start.params[TASKS][
+                    ..., [*self.start.dims].index(task)]
         optimizer = fac.Adam({**student.params, TASKS: embedding})
         scales = np.zeros((1, sizes.dim_obs - EMBEDDING, len(self.dims)), fac.F32)
         for k, teacher in enumerate(self.teachers.values()):
@@ -261,6 +270,7 @@ def distil(args, config, out, seed, centralized):
     """Distil a student of args.tasks into the folder `out`, or go on there; result. It's saved
     after each of `marked` steps, too, as step-N.npz."""
     teachers, plannings, out = {}, {}, Path(out)
+    start = load(args.start)[0] if args.start else None
     with contextlib.ExitStack() as stack:
         for task in args.tasks:
             expert, header, replay, path = fac.load_data(argparse.Namespace(
@@ -269,10 +279,11 @@ def distil(args, config, out, seed, centralized):
             teachers[task] = stack.enter_context(contextlib.closing(fac.Distiller(
                 expert, replay, config, 1 if centralized else None, seed)))
         settings = {"seed": seed, "centralized": centralized, "distill": vars(config), "of": {
-            task: fac.data_checksums(of.expert, of.replay) for task, of in teachers.items()}}
+            task: fac.data_checksums(of.expert, of.replay) for task, of in teachers.items()},
+            "start": start and fac.checksum(start.params.values())}
         distiller = stack.enter_context(contextlib.closing(MultitaskDistiller(
             teachers, config, centralized, seed,
-            {step: out / f"step-{step}.npz" for step in marked(config.steps)}, settings)))
+            {step: out / f"step-{step}.npz" for step in marked(config.steps)}, settings, start)))
         stack.enter_context(fac.locked(out))
         if (path := out / "student.npz").exists():
             _, before = load(path)
@@ -506,6 +517,8 @@ def make_parser():
     option("--seed", type=fac.natural, default=0, help="of distillation [0]")
     option("--centralized", action="store_true", help="one agent, with the same encoder, about as "
            "many weights, the same states")
+    option("--start", help="a student of other tasks to begin from, e.g. of all but the --tasks "
+           "here, to see what these learn from those")
     option("--out", help="folder for the results [runs/multitask-SEED, "
            "runs/multitask-centralized-SEED]")
     option = add("evaluate", command_evaluate, "Plan with a student in each of its tasks, by "
@@ -524,6 +537,7 @@ def make_parser():
     option = add("figure10", command_figure10, "Return against steps of the factored student and "
                  "of a centralized one, each planning alone and around its teachers' policies; "
                  "then latents.", small, epilog="The same command again makes what is missing.")
+    commands.choices["figure10"].set_defaults(start=None)
     option("--seeds", nargs="+", type=fac.natural, default=[0, 1, 2], metavar="SEED",
            help="of distillation [0 1 2]")
     option("--episodes", type=positive, default=5, help="of each evaluation [5]")

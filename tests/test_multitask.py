@@ -13,6 +13,7 @@ import pytest
 
 import experiments
 import fac_tdmpc_ref as fac
+import latents
 import multitask
 import test_cli
 from test_cli import ONE_THREAD, ROOT, last_json, launch, succeeded, write_expert, write_replay
@@ -179,6 +180,30 @@ def test_embeddings_stay_within_norm_1(data):
         assert (np.linalg.norm(embedding, axis=1) <= 1 + 1e-6).all()
 
 
+def test_a_student_may_begin_from_one_of_other_tasks(data):
+    """With all its weights, and the embeddings of tasks that both know."""
+    with distiller_of(data, ["walker-walk", "reacher-hard"]) as distiller:
+        start = distiller.student
+        teachers = distiller.teachers
+        for _ in range(3):
+            distiller.step()
+        other = {"hopper-hop": teachers["walker-walk"], "reacher-hard": teachers["reacher-hard"]}
+        with contextlib.closing(multitask.MultitaskDistiller(other, CONFIG, start=start)) as begun:
+            new, old = begun.student.params, start.params
+            for key in old:
+                if key not in (multitask.TASKS, multitask.SCALES):
+                    assert np.array_equal(new[key], old[key])
+            assert np.array_equal(new[multitask.TASKS][..., 1], old[multitask.TASKS][..., 1])
+            assert not np.array_equal(new[multitask.TASKS][..., 0], old[multitask.TASKS][..., 0])
+            begun.step()
+            assert not np.array_equal(new["_encoder.0.weight"], old["_encoder.0.weight"])
+        with pytest.raises(fac.UserError, match="--start: expected a student .* as many agents"):
+            multitask.MultitaskDistiller(teachers, CONFIG, centralized=True, start=start)
+    with distiller_of(data, ["reacher-hard"]) as narrow:
+        with pytest.raises(fac.UserError, match="--start: expected a student for robots as wide"):
+            multitask.MultitaskDistiller(teachers, CONFIG, start=narrow.student)
+
+
 # the program --------------------------------------------------------------------------
 
 
@@ -273,6 +298,9 @@ def test_a_killed_run_goes_on_to_the_same_end(data, student, tmp_path):
     (["distill", "--tasks", "cheetah-run", "--data", "{data}"], ["cheetah-run", "no such file"]),
     (["distill", "--steps", "0"], ["steps", "at least 1"]),
     (["distill", "--targets", "joint"], ["--targets"]),
+    (["distill", "--start", "{data}/walker-walk/expert.npz"], ["kind", "'multitask'"]),
+    (["latents", "--model", "{model}"], ["student.npz", "one of hopper", "reacher-hard"]),
+    (["latents", "--model", "{model}", "--out", "x.gif"], ["x.gif", ".png"]),
     (["evaluate", "--model", "none.npz"], ["none.npz", "no such file"]),
     (["evaluate", "--model", "{data}/walker-walk/expert.npz"], ["kind", "'multitask'"]),
     (["evaluate", "--model", "{model}", "--tasks", "hopper-hop"],
@@ -298,6 +326,43 @@ def test_a_damaged_file_is_named(student, tmp_path, change, parts):
     with pytest.raises(fac.UserError) as error:
         multitask.load(tmp_path / "odd.npz")
     assert all(part in str(error.value) for part in [*parts, "odd.npz"])
+
+
+def synthetic(parts, rng, spread=0.1):
+    """Latents (N, 8, 200) of agents around a place of their own for each of `parts`."""
+    places = np.random.default_rng(0).standard_normal((9, 8, 1))
+    return np.stack([places[part] + spread * rng.standard_normal((8, 200)) for part in parts])
+
+
+def test_silhouettes_tell_joints_from_tasks():
+    pytest.importorskip("sklearn")
+    rng = np.random.default_rng(1)
+    alike = {task: synthetic(range(4), rng) for task in ("a", "b", "c")}
+    found = latents.silhouettes(alike, rng)
+    assert found["joint"] > 0.8 and abs(found["task"]) < 0.1
+    assert abs(found["joints shuffled"]) < 0.1 > abs(found["task within a joint"])
+    apart = {"a": synthetic([0] * 4, rng), "b": synthetic([1] * 4, rng)}
+    found = latents.silhouettes(apart, rng)
+    assert found["task"] > 0.8 < found["task within a joint"] and found["joint"] < 0.1
+
+
+@pytest.mark.parametrize("hopper, other, slots", [
+    ((6, 0, 1, 2), 1, 1 / 3), ((0, 1, 2, 6), 1 / 3, 1), ((6, 7, 8, 7), None, None)])
+def test_recognition_tells_anatomy_from_slots(hopper, other, slots):
+    """Latents of the hopper's waist, hip, knee, ankle like the walker's hip, knee, ankle (0, 1, 2);
+    like those of the same slots; like neither."""
+    pytest.importorskip("sklearn")
+    rng = np.random.default_rng(2)
+    walker, hopper = synthetic((0, 1, 2, 0, 1, 2), rng), synthetic(hopper, rng)
+    found = latents.recognition(walker, hopper)
+    assert found["walker's right leg, then its left"]["other leg"] == 1
+    for name in ("walker's right leg, then hopper", "hopper, then walker's right leg"):
+        assert found[name]["itself"] > 0.99 or other is None
+    got = found["walker's right leg, then hopper"]
+    if other == 1:
+        assert got["other leg"] > 0.99 and got["same slots there"] <= 1 / 3 + 0.34
+    elif slots == 1:
+        assert got["same slots there"] > 0.99 and got["other leg"] <= 1 / 3
 
 
 @pytest.fixture
