@@ -16,6 +16,7 @@ import fac_tdmpc_ref as fac
 import latents
 import multitask
 import test_cli
+from multitask_model import SCALES, TASKS, Multitask, MultitaskDistiller, load
 from test_cli import ONE_THREAD, ROOT, last_json, launch, succeeded, write_expert, write_replay
 from test_layers import assert_close, numeric_gradient
 
@@ -44,19 +45,19 @@ def distiller_of(data, tasks=tuple(ROBOTS), config=CONFIG, centralized=False, se
         teachers = {task: stack.enter_context(contextlib.closing(fac.Distiller(
             fac.load_model(data / task / "expert.npz")[0], fac.Replay(data / task / "replay.npz"),
             config, 1 if centralized else None, seed))) for task in tasks}
-        yield stack.enter_context(contextlib.closing(multitask.MultitaskDistiller(
+        yield stack.enter_context(contextlib.closing(MultitaskDistiller(
             teachers, config, centralized, seed)))
 
 
 def in_float64(student):
     """A copy in double precision, whose last layers aren't zero."""
     rng = np.random.default_rng(3)
-    params = {key: value + 0.1 * rng.standard_normal(value.shape) * (key != multitask.SCALES)
+    params = {key: value + 0.1 * rng.standard_normal(value.shape) * (key != SCALES)
               for key, value in student.params.items()}
-    return multitask.Multitask(student.config, params, student.dims)
+    return Multitask(student.config, params, student.dims)
 
 
-def loss_of(student, batch, grads=None, loss=multitask.MultitaskDistiller.loss):
+def loss_of(student, batch, grads=None, loss=MultitaskDistiller.loss):
     features, actions, targets = (
         [x.astype(float) for x in part] if isinstance(part, list) else part.astype(float)
         for part in batch)
@@ -65,7 +66,7 @@ def loss_of(student, batch, grads=None, loss=multitask.MultitaskDistiller.loss):
 
 def gradients(student, batch):
     grads = {key: np.zeros_like(value) for key, value in student.params.items()
-             if key != multitask.SCALES}
+             if key != SCALES}
     loss_of(student, batch, grads)
     return grads
 
@@ -78,7 +79,7 @@ def test_gradients_through_embedding_and_mask(data, centralized):
     assert set(np.argmax(batch[0][0, -3:], 0)) == {0, 1, 2}, "a batch mixes tasks"
     assert np.isnan(batch[2][0]).any() != centralized
     grads = gradients(student, batch)
-    for key in (multitask.TASKS, "_encoder.0.bias", "_dynamics.4.bias", "_Q1.1.weight"):
+    for key in (TASKS, "_encoder.0.bias", "_dynamics.4.bias", "_Q1.1.weight"):
         value = student.params[key]
         part = value if value.shape[1] < 60 else value[:, :60]  # a view, which differences change
         numeric = numeric_gradient(lambda: loss_of(student, batch), part)
@@ -97,9 +98,9 @@ def test_agents_that_a_robot_lacks_change_nothing(data, task):
     own = student.of_task(task)
     m = student.config.latent_dim
     for key, value in student.params.items():  # what only absent agents, other tasks have
-        if key == multitask.SCALES:
+        if key == SCALES:
             continue
-        if key == multitask.TASKS:
+        if key == TASKS:
             value[..., [k for k in range(3) if k != number]] += 1
             assert not np.delete(grads[key], number, 2).any() and grads[key][..., number].any()
         elif key.startswith("_encoder.2"):
@@ -168,14 +169,14 @@ def test_distilling_learns_repeats_and_goes_on_from_a_state(data):
 
 def test_embeddings_stay_within_norm_1(data):
     with distiller_of(data) as distiller:
-        embedding = distiller.student.params[multitask.TASKS]
+        embedding = distiller.student.params[TASKS]
         assert_close(np.linalg.norm(embedding, axis=1), np.ones((1, 3)), 1e-6)
         before = embedding.copy()
         for _ in range(20):
             distiller.step()
         assert (np.linalg.norm(embedding, axis=1) <= 1 + 1e-6).all()
         assert np.abs(embedding - before).max() > 1e-3, "they learn"
-        distiller.student.params[multitask.TASKS][..., 1] *= 9
+        distiller.student.params[TASKS][..., 1] *= 9
         distiller.step()
         assert (np.linalg.norm(embedding, axis=1) <= 1 + 1e-6).all()
 
@@ -188,20 +189,20 @@ def test_a_student_may_begin_from_one_of_other_tasks(data):
         for _ in range(3):
             distiller.step()
         other = {"hopper-hop": teachers["walker-walk"], "reacher-hard": teachers["reacher-hard"]}
-        with contextlib.closing(multitask.MultitaskDistiller(other, CONFIG, start=start)) as begun:
+        with contextlib.closing(MultitaskDistiller(other, CONFIG, start=start)) as begun:
             new, old = begun.student.params, start.params
             for key in old:
-                if key not in (multitask.TASKS, multitask.SCALES):
+                if key not in (TASKS, SCALES):
                     assert np.array_equal(new[key], old[key])
-            assert np.array_equal(new[multitask.TASKS][..., 1], old[multitask.TASKS][..., 1])
-            assert not np.array_equal(new[multitask.TASKS][..., 0], old[multitask.TASKS][..., 0])
+            assert np.array_equal(new[TASKS][..., 1], old[TASKS][..., 1])
+            assert not np.array_equal(new[TASKS][..., 0], old[TASKS][..., 0])
             begun.step()
             assert not np.array_equal(new["_encoder.0.weight"], old["_encoder.0.weight"])
         with pytest.raises(fac.UserError, match="--start: expected a student .* as many agents"):
-            multitask.MultitaskDistiller(teachers, CONFIG, centralized=True, start=start)
+            MultitaskDistiller(teachers, CONFIG, centralized=True, start=start)
     with distiller_of(data, ["reacher-hard"]) as narrow:
         with pytest.raises(fac.UserError, match="--start: expected a student for robots as wide"):
-            multitask.MultitaskDistiller(teachers, CONFIG, start=narrow.student)
+            MultitaskDistiller(teachers, CONFIG, start=narrow.student)
 
 
 # the program --------------------------------------------------------------------------
@@ -224,10 +225,10 @@ def test_two_robots_end_to_end(data, student):
     assert found["tasks"] == ["reacher-hard", "walker-walk"] and found["num_agents"] == 6
     assert {k: len(v) for k, v in found["rank_correlation_returns"].items()} == {
         "reacher-hard": 2, "walker-walk": 2}
-    model, header = multitask.load(folder / "two" / "student.npz")
+    model, header = load(folder / "two" / "student.npz")
     assert header["distill"]["steps"] == 24 and model.dims == {
         "reacher-hard": [8, 3], "walker-walk": [24, 6]}
-    scales = model.params.pop(multitask.SCALES)
+    scales = model.params.pop(SCALES)
     assert sum(v.size for v in model.params.values()) == found["weights"]
     for k, task in enumerate(model.dims):
         rows = fac.Replay(data / task / "replay.npz").observation
@@ -263,6 +264,7 @@ KILLED = """
 import os, signal, sys
 sys.path.insert(0, {root!r})
 import multitask
+
 write = multitask.fac.write_npz
 def killing(path, header, arrays, *more):
     write(path, header, arrays, *more)
@@ -284,7 +286,7 @@ def test_a_killed_run_goes_on_to_the_same_end(data, student, tmp_path):
     _, arrays = fac.read_npz(tmp_path / "two" / "checkpoint.npz", ("checkpoint",))
     assert 0 < arrays["step"] < 24
     succeeded(run(*flags, cwd=tmp_path))
-    ours, theirs = (multitask.load(folder / "two" / "student.npz")[0].params
+    ours, theirs = (load(folder / "two" / "student.npz")[0].params
                     for folder in (tmp_path, student[0]))
     assert all(np.array_equal(ours[key], theirs[key]) for key in theirs)
     succeeded(run(*flags, cwd=tmp_path))  # a finished one stays
@@ -312,10 +314,16 @@ def test_bad_input_is_one_line(tmp_path, data, student, flags, parts):
     refused(run(*(flag.format(**values) for flag in flags), cwd=tmp_path), *parts)
 
 
+def test_another_expert_than_the_student_s_is_refused(tmp_path, student):
+    write_expert(tmp_path / "walker-walk" / "expert.npz", "walker-walk", (24, 6), seed=5)
+    refused(run("evaluate", "--model", student[0] / "two" / "student.npz", "--data", tmp_path,
+                "--tasks", "walker-walk", cwd=tmp_path), "another expert", "--data")
+
+
 @pytest.mark.parametrize("change, parts", [
     (lambda h, a: a.pop("_dynamics.0.weight"), ["_dynamics.0.weight", "(6, 85, 51)"]),
     (lambda h, a: a.update(x=np.zeros(1, np.float32)), ["x: expected", "nothing"]),
-    (lambda h, a: a[multitask.TASKS].fill(np.nan), [multitask.TASKS, "finite"]),
+    (lambda h, a: a[TASKS].fill(np.nan), [TASKS, "finite"]),
     (lambda h, a: h.update(tasks={"walker-walk": [24, 5]}), ["walker-walk", "[24, 6]", "[24, 5]"]),
     (lambda h, a: h.update(tasks=["walker-walk"]), ["tasks", "sizes by task"]),
     (lambda h, a: h["model"].update(enc_dim=0), ["model", "enc_dim", "at least 1"])])
@@ -324,7 +332,7 @@ def test_a_damaged_file_is_named(student, tmp_path, change, parts):
     change(header, arrays)
     fac.write_npz(tmp_path / "odd.npz", json.loads(json.dumps(header)), arrays)
     with pytest.raises(fac.UserError) as error:
-        multitask.load(tmp_path / "odd.npz")
+        load(tmp_path / "odd.npz")
     assert all(part in str(error.value) for part in [*parts, "odd.npz"])
 
 
@@ -402,7 +410,7 @@ def test_figure_10(data, tmp_path, monkeypatch, capsys, short_episodes):
     for case in cases:
         assert np.allclose(returns["mean of 2 tasks"][case]["12.0"], np.mean([
             returns[task][case]["12.0"] for task in ("walker-walk", "hopper-hop")], 0))
-    model, _ = multitask.load("students/1/TD-MPC/step-12.npz")
+    model, _ = load("students/1/TD-MPC/step-12.npz")
     expert, header, path = multitask.load_expert("walker-walk", data)
     planning = fac.PlannerConfig(**fac.STUDENT_PLANNING, **{**fac.made_for(header, path),
                                                             "horizon": 1})
