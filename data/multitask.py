@@ -83,7 +83,7 @@ def distil(args, config, out, seed, centralized):
                 expert, replay, config, 1 if centralized else None, seed)))
         settings = {"seed": seed, "centralized": centralized, "distill": vars(config), "of": {
             task: fac.data_checksums(of.expert, of.replay) for task, of in teachers.items()},
-            "start": start and fac.checksum(start.params.values())}
+            "start": start and fac.checksum(start.params.values()), "order": args.tasks}
         distiller = stack.enter_context(contextlib.closing(MultitaskDistiller(
             teachers, config, centralized, seed,
             {step: out / f"step-{step}.npz" for step in marked(config.steps)}, settings, start)))

@@ -290,8 +290,8 @@ def test_a_killed_run_goes_on_to_the_same_end(data, student, tmp_path):
                     for folder in (tmp_path, student[0]))
     assert all(np.array_equal(ours[key], theirs[key]) for key in theirs)
     succeeded(run(*flags, cwd=tmp_path))  # a finished one stays
-    refused_line = run(*flags[:-1], "1", cwd=tmp_path)
-    refused(refused_line, "student.npz", "expert_episodes", "--out")
+    for more in (["--expert-episodes", "1"], ["--tasks", "walker-walk", "reacher-hard"]):
+        refused(run(*flags, *more, cwd=tmp_path), "student.npz", "other settings", "--out")
 
 
 @pytest.mark.parametrize("flags, parts", [
