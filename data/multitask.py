@@ -161,14 +161,16 @@ def command_evaluate(args):
         found[task] = fac.evaluate(student.of_task(task, expert), task, planning, args.episodes,
                                    args.seed, args.workers, task)
         found[task]["teacher_returns"] = recorded(expert, own, path, args.episodes, args.seed)
-    rows = [[np.mean(of["returns"]), np.std(of["returns"]), np.mean(of["teacher_returns"]),
-             of["plan_ms_median"]] for of in found.values()]
-    means = np.mean(rows, 0).tolist()
+    rows = [[np.mean(of["returns"]), np.mean(of["teacher_returns"]), of["plan_ms_median"]]
+            for of in found.values()]
+    mean, teachers, _ = means = np.mean(rows, 0).tolist()
+    spread = [f" ± {np.std(of['returns']):.0f}" for of in found.values()]
     fac.print_table([("task", "student", "teacher", "kept", "ms a decision"), *(
-        (task, f"{mean:.0f} ± {std:.0f}", f"{teacher:.0f}", f"{mean / max(teacher, 1e-9):.2f}",
-         f"{ms:.1f}") for task, (mean, std, teacher, ms) in zip([*found, "mean"], [*rows, means]))])
-    return {"tasks": found, "episodes": args.episodes, "seed": args.seed, "return_mean": means[0],
-            "teacher_mean": means[2], "kept": fac.return_kept(means[0], means[2])}
+        (task, f"{student:.0f}{std}", f"{teacher:.0f}", f"{student / max(teacher, 1e-9):.2f}",
+         f"{ms:.1f}") for task, std, (student, teacher, ms) in zip(
+            [*found, "mean"], [*spread, ""], [*rows, means]))])
+    return {"tasks": found, "episodes": args.episodes, "seed": args.seed, "return_mean": mean,
+            "teacher_mean": teachers, "kept": fac.return_kept(mean, teachers)}
 
 
 # ----------------------------------------------------------------------------------- latents
