@@ -73,18 +73,17 @@ def gradients(student, batch):
 
 @pytest.mark.parametrize("centralized", [False, True])
 def test_gradients_through_embedding_and_mask(data, centralized):
-    """Of a batch of all robots, by what is smallest of each network, against differences."""
+    """Of a batch of all robots, by the first rows of what each network has, against differences."""
     with distiller_of(data, centralized=centralized) as distiller:
         student, batch = in_float64(distiller.student), distiller.batch(0)
     assert set(np.argmax(batch[0][0, -3:], 0)) == {0, 1, 2}, "a batch mixes tasks"
     assert np.isnan(batch[2][0]).any() != centralized
     grads = gradients(student, batch)
     for key in (TASKS, "_encoder.0.bias", "_dynamics.4.bias", "_Q1.1.weight"):
-        value = student.params[key]
-        part = value if value.shape[1] < 60 else value[:, :60]  # a view, which differences change
+        part = student.params[key][:, :8]  # a view, which differences change
         numeric = numeric_gradient(lambda: loss_of(student, batch), part)
         assert np.abs(numeric).max() > 1e-6
-        assert_close(grads[key][:, :part.shape[1]], numeric, 1e-5)
+        assert_close(grads[key][:, :8], numeric, 1e-5)
 
 
 @pytest.mark.parametrize("task", ROBOTS)
@@ -235,19 +234,48 @@ def test_two_robots_end_to_end(data, student):
         assert_close(scales[0, :rows.shape[1], k], 1 / rows.std(0, dtype=float), 1e-6)
     with open(folder / "two" / "curve.csv", newline="") as file:
         assert [row["step"] for row in csv.DictReader(file)][-1] == "24"
-    budget = ["--samples", "16", "--iterations", "1", "--episodes", "1", "--data", data]
-    played = [last_json(run("evaluate", "--model", "two/student.npz", *budget, *flags, "--json",
-                            cwd=folder)) for flags in (
-        ["--workers", "0"], ["--workers", "1"], ["--prior", "none", "--tasks", "walker-walk"])]
-    assert played[0]["tasks"]["walker-walk"]["returns"] == played[1]["tasks"]["walker-walk"][
-        "returns"], "the number of processes changes nothing"
-    assert set(played[0]["tasks"]) == {"reacher-hard", "walker-walk"}
-    assert set(played[2]["tasks"]) == {"walker-walk"}
-    alone, around = (found["tasks"]["walker-walk"] for found in (played[2], played[0]))
-    assert alone["returns"] != around["returns"]
-    assert len(around["teacher_returns"]) == 1 and around["plan_ms_median"] > 0
-    assert played[0]["return_mean"] == np.mean([
-        x["returns"][0] for x in played[0]["tasks"].values()])
+    done = run("evaluate", "--model", "two/student.npz", "--samples", "16", "--iterations", "1",
+               "--episodes", "1", "--data", data, "--tasks", "walker-walk", "--workers", "1",
+               "--json", cwd=folder)  # the student goes to another process
+    found = last_json(done)["tasks"]
+    assert set(found) == {"walker-walk"} and len(found["walker-walk"]["returns"]) == 1
+    assert "walker-walk" in done.stdout and "mean" in done.stdout
+
+
+@pytest.fixture
+def short_episodes(monkeypatch):
+    """Of 10 decisions; an experiment's runs are made in this process."""
+    def in_this_process(function, runs, _):
+        for run in runs:
+            yield experiments.attempt(function, run, os.getpid())
+
+    monkeypatch.setattr(fac, "CONTROL_STEPS", 20)
+    monkeypatch.setattr(experiments, "in_processes", in_this_process)
+
+
+def test_evaluate(data, student, capsys, short_episodes):
+    def evaluated(*more):
+        assert multitask.main(["evaluate", "--model", str(student[0] / "two" / "student.npz"),
+                               "--episodes", "2", "--data", str(data), "--workers", "0",
+                               "--json", *more]) == 0
+        return json.loads(capsys.readouterr().out.splitlines()[-1])
+
+    around, alone = evaluated(), evaluated("--prior", "none", "--tasks", "walker-walk")
+    assert set(around["tasks"]) == {"reacher-hard", "walker-walk"}
+    assert set(alone["tasks"]) == {"walker-walk"}
+    found = around["tasks"]["walker-walk"]
+    assert alone["tasks"]["walker-walk"]["returns"] != found["returns"]
+    assert alone["tasks"]["walker-walk"]["teacher_returns"] == found["teacher_returns"]
+    for name, key in (("return_mean", "returns"), ("teacher_mean", "teacher_returns")):
+        assert np.isclose(around[name], np.mean([of[key] for of in around["tasks"].values()]))
+    model, _ = load(student[0] / "two" / "student.npz")
+    expert, header, path = multitask.load_expert("walker-walk", data)
+    for prior, returns in (("policy", found), ("none", alone["tasks"]["walker-walk"])):
+        planning = fac.PlannerConfig(horizon=1, **(fac.STUDENT_PLANNING if prior == "policy"
+                                                   else {}))
+        played = fac.evaluate(model.of_task("walker-walk", expert), "walker-walk", planning, 2, 0,
+                              0)["returns"]
+        assert played == returns["returns"]
 
 
 def test_help_is_quick(tmp_path):
@@ -371,17 +399,6 @@ def test_recognition_tells_anatomy_from_slots(hopper, other, slots):
         assert got["other leg"] > 0.99 and got["same slots there"] <= 1 / 3 + 0.34
     elif slots == 1:
         assert got["same slots there"] > 0.99 and got["other leg"] <= 1 / 3
-
-
-@pytest.fixture
-def short_episodes(monkeypatch):
-    """Of 10 decisions; an experiment's runs are made in this process."""
-    def in_this_process(function, runs, _):
-        for run in runs:
-            yield experiments.attempt(function, run, os.getpid())
-
-    monkeypatch.setattr(fac, "CONTROL_STEPS", 20)
-    monkeypatch.setattr(experiments, "in_processes", in_this_process)
 
 
 def figure10(capsys, data, *more):
