@@ -2,11 +2,13 @@
 import contextlib
 import csv
 import functools
+import io
 import json
 import os
 import signal
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -211,12 +213,29 @@ def run(*arguments, cwd, env=ONE_THREAD):
     return launch([SCRIPT, *arguments], cwd, env)
 
 
+def said(*arguments):
+    """What a command, run in this process, prints as its last line."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        assert multitask.main([*map(str, arguments), "--json"]) == 0
+    return json.loads(out.getvalue().splitlines()[-1])
+
+
+def refused_here(capsys, arguments, *parts):
+    """As `refused`, of a command that is run in this process."""
+    try:
+        code = multitask.main([*map(str, arguments)])
+    except SystemExit as end:  # argparse's
+        code = end.code
+    refused(SimpleNamespace(returncode=code, **dict(zip(("stdout", "stderr"),
+                                                        capsys.readouterr()))), *parts)
+
+
 @pytest.fixture(scope="module")
 def student(data, tmp_path_factory):
     """A run of two tasks, and what distill said of it."""
     folder = tmp_path_factory.mktemp("run")
-    return folder, last_json(run("distill", "--tasks", "reacher-hard,walker-walk", "--data", data,
-                                 "--steps", "24", "--out", "two", *TINY, "--json", cwd=folder))
+    return folder, said("distill", "--tasks", "reacher-hard,walker-walk", "--data", data,
+                        "--steps", "24", "--out", folder / "two", *TINY)
 
 
 def test_two_robots_end_to_end(data, student):
@@ -253,13 +272,9 @@ def short_episodes(monkeypatch):
     monkeypatch.setattr(experiments, "in_processes", in_this_process)
 
 
-def test_evaluate(data, student, capsys, short_episodes):
-    def evaluated(*more):
-        assert multitask.main(["evaluate", "--model", str(student[0] / "two" / "student.npz"),
-                               "--episodes", "2", "--data", str(data), "--workers", "0",
-                               "--json", *more]) == 0
-        return json.loads(capsys.readouterr().out.splitlines()[-1])
-
+def test_evaluate(data, student, short_episodes):
+    evaluated = functools.partial(said, "evaluate", "--model", student[0] / "two" / "student.npz",
+                                  "--episodes", "2", "--data", data, "--workers", "0")
     around, alone = evaluated(), evaluated("--prior", "none", "--tasks", "walker-walk")
     assert set(around["tasks"]) == {"reacher-hard", "walker-walk"}
     assert set(alone["tasks"]) == {"walker-walk"}
@@ -304,7 +319,7 @@ multitask.main(sys.argv[1:])
 """
 
 
-def test_a_killed_run_goes_on_to_the_same_end(data, student, tmp_path):
+def test_a_killed_run_goes_on_to_the_same_end(data, student, tmp_path, monkeypatch, capsys):
     flags = ["distill", "--tasks", "reacher-hard", "walker-walk", "--data", str(data), "--steps",
              "24", "--out", "two", *TINY]
     code = KILLED.format(root=str(ROOT / "data"))
@@ -318,8 +333,9 @@ def test_a_killed_run_goes_on_to_the_same_end(data, student, tmp_path):
                     for folder in (tmp_path, student[0]))
     assert all(np.array_equal(ours[key], theirs[key]) for key in theirs)
     succeeded(run(*flags, cwd=tmp_path))  # a finished one stays
+    monkeypatch.chdir(tmp_path)
     for more in (["--expert-episodes", "1"], ["--tasks", "walker-walk", "reacher-hard"]):
-        refused(run(*flags, *more, cwd=tmp_path), "student.npz", "other settings", "--out")
+        refused_here(capsys, [*flags, *more], "student.npz", "other settings", "--out")
 
 
 @pytest.mark.parametrize("flags, parts", [
@@ -337,15 +353,15 @@ def test_a_killed_run_goes_on_to_the_same_end(data, student, tmp_path):
      ["hopper-hop", "is of reacher-hard, walker-walk"]),
     (["evaluate", "--model", "{model}", "--data", "none"], ["none", "expert.npz", "no such file"]),
     (["evaluate", "--model", "{model}", "--episodes", "0"], ["episodes", "at least 1"])])
-def test_bad_input_is_one_line(tmp_path, data, student, flags, parts):
+def test_bad_input_is_one_line(capsys, data, student, flags, parts):
     values = {"data": data, "model": student[0] / "two" / "student.npz"}
-    refused(run(*(flag.format(**values) for flag in flags), cwd=tmp_path), *parts)
+    refused_here(capsys, [flag.format(**values) for flag in flags], *parts)
 
 
-def test_another_expert_than_the_student_s_is_refused(tmp_path, student):
+def test_another_expert_than_the_student_s_is_refused(capsys, tmp_path, student):
     write_expert(tmp_path / "walker-walk" / "expert.npz", "walker-walk", (24, 6), seed=5)
-    refused(run("evaluate", "--model", student[0] / "two" / "student.npz", "--data", tmp_path,
-                "--tasks", "walker-walk", cwd=tmp_path), "another expert", "--data")
+    refused_here(capsys, ["evaluate", "--model", student[0] / "two" / "student.npz", "--data",
+                          tmp_path, "--tasks", "walker-walk"], "another expert", "--data")
 
 
 @pytest.mark.parametrize("change, parts", [
