@@ -356,6 +356,11 @@ class WorldModel:
         z = forward(ENCODER, self.params, "_encoder", x, tape)
         return z.reshape(self.config.num_agents, self.config.latent_dim, -1)
 
+    def encode_backward(self, dz, tape, grads):
+        """Walk `encode_features` back from dz (N, m, B): adds to `grads`, returns dx (1, F, B)."""
+        return backward(ENCODER, self.params, "_encoder", tape, dz.reshape(1, -1, dz.shape[-1]),
+                        grads)
+
     def features(self, obs, z):
         """What the trained encoder reads (1, F, B): observations (O, B), or the expert's latents z
         of them (N, m, B) [D3]."""
@@ -506,8 +511,7 @@ def distill_loss(student, features, actions, targets, config, grads=None, diverg
     if grads is not None:
         dx = heads_backward(student, tapes, d_shares, grads)
         dz = unroll_backward(student, tapes, actions, dx, grads)
-        backward(ENCODER, student.params, "_encoder", encoder_tape,
-                 dz.reshape(1, -1, z.shape[-1]), grads)
+        student.encode_backward(dz, encoder_tape, grads)
     return losses
 
 
@@ -1035,7 +1039,8 @@ class Distiller:
     num_agents: N, or `groups`; sizes: replace `student_config`'s. UserError if expert, replay and
     config don't fit."""
 
-    loss, perturb = staticmethod(distill_loss), staticmethod(taught_batch)  # or a subclass's own
+    create, loss, perturb = map(staticmethod, (new_student, distill_loss, taught_batch))
+    # or a subclass's own; ranks, too
 
     def __init__(self, expert, replay, config, num_agents=None, seed=0, **sizes):
         keep_memory()
@@ -1067,7 +1072,7 @@ class Distiller:
             config.expert_episodes * EPISODE_STEPS * (theirs.dim_obs + theirs.dim_action),
             config, sizes)
         with one_thread():
-            self.optimizer, self.student = new_student(expert, sizes, seed)
+            self.optimizer, self.student = self.create(expert, sizes, seed)
         self._number = None
         self._threads = ThreadPoolExecutor(2, "", functools.partial(np.seterr, all="ignore"))
         self._halves = [flatten({k: np.zeros_like(v) for k, v in self.optimizer.params.items()})
@@ -1164,6 +1169,10 @@ class Distiller:
         load_optimizer(self.optimizer, state)
         played = state["played"].reshape(-1, self.played.shape[1])  # or it is another robot's
         self.played, self.lengths, self._number = played, state["lengths"], None
+
+    def ranks(self, states, discount):
+        """`rank_correlation`, which the learning curve shows."""
+        return rank_correlation(self, states, discount)
 
     def close(self):
         """Stop the threads."""
@@ -2119,7 +2128,7 @@ def train_student(distiller, out, settings, planning, workers):
             if distiller.t % every and distiller.t < config.steps:
                 continue
             means, losses = np.mean(losses, 0).tolist(), []
-            q, g = (x.tolist() for x in rank_correlation(distiller, 64, planning.discount))
+            q, g = (x.tolist() for x in distiller.ranks(64, planning.discount))
             check_finite({"weights are": distiller.optimizer.vector,
                           "student's predictions are": q}, distiller.t, config.lr)
             seconds = before + time.time() - began

@@ -52,8 +52,7 @@ def consistency_loss(student, features, actions, targets, config, grads=None, we
         dx = fac.heads_backward(student, tapes, d_shares, grads)
         latents_after_backward(student, end_tape, 2 * scale * lam * gap, dx, B * K, grads)
         dz = fac.unroll_backward(student, tapes, actions, dx, grads)
-        fac.backward(fac.ENCODER, student.params, "_encoder", encoder_tape,
-                     dz.reshape(1, -1, B), grads)
+        student.encode_backward(dz, encoder_tape, grads)
     return loss + float(scale * (lam * gap ** 2).sum()), *means
 
 

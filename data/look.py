@@ -141,18 +141,22 @@ NOISE = fac.DistillConfig.noise_std  # around what is done, for the additive cei
 SMOOTH = 10  # decisions over which a change of the return counts
 
 
+def t_sne(x):
+    """Points (n, m) in two dimensions."""
+    from sklearn.manifold import TSNE
+    return TSNE(random_state=0, init="pca", perplexity=min(30, len(x) / 4)).fit_transform(x)
+
+
 def clusters(z, rng, points):
     """Latents (N, m, B) of some states as points: t-SNE and PCA, (n, 2) each, their joints (n,),
     and the silhouette by joint and by shuffled joints."""
     with fac.optional("scikit-learn", "experiments"):
         from sklearn.decomposition import PCA
-        from sklearn.manifold import TSNE
         from sklearn.metrics import silhouette_score
     chosen = z[:, :, rng.choice(z.shape[2], min(points, z.shape[2]), replace=False)]
     x = chosen.swapaxes(1, 2).reshape(-1, z.shape[1])
     joints = np.repeat(np.arange(len(z)), chosen.shape[2])
-    flat = (TSNE(random_state=0, init="pca", perplexity=min(30, len(x) / 4)).fit_transform(x),
-            PCA(2).fit_transform(x))
+    flat = t_sne(x), PCA(2).fit_transform(x)
     one = len(z) == 1  # no other joints to be apart from
     return *flat, joints, *(None if one else float(silhouette_score(x, labels))
                             for labels in (joints, rng.permutation(joints)))

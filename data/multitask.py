@@ -1,0 +1,364 @@
+#!/usr/bin/env python3
+"""Section 5.7: one factored student for many tasks and robots, and Figure 10.
+
+    python data/multitask.py distill --tasks walker-walk hopper-hop
+    python data/multitask.py evaluate --model runs/multitask-0/student.npz
+    python data/multitask.py figure10
+
+What the student is, and how it learns from several experts, is in multitask_model.py.
+"""
+import argparse
+import contextlib
+import functools
+import itertools
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
+import experiments  # noqa: E402
+import fac_tdmpc_ref as fac  # noqa: E402
+import latents  # noqa: E402
+from multitask_model import MultitaskDistiller, load, save  # noqa: E402
+
+# ----------------------------------------------------------------------------------- distill
+
+MOST_ACTIONS = 6  # of the paper's robots here
+MARKS = (0.03, 0.1, 0.3, 1.0)  # shares of the steps after which Figure 10's students play
+
+
+def named(tasks):
+    """The tasks that --tasks names, between spaces or commas; UserError: unknown, or twice."""
+    found = [task for text in tasks for task in text.split(",")]
+    for task in found:
+        fac.lookup_task(task)
+        fac.need(found.count(task) == 1, f"--tasks: {task} is there twice")
+    return found
+
+
+def small_tasks():
+    """The tasks in data/ whose robots have at most MOST_ACTIONS action dimensions."""
+    found = sorted(path.parent.name for path in fac.DATA.glob("*/expert.npz"))
+    fac.need(found, f"{fac.DATA}: holds no experts; name --data and --tasks")
+    return [task for task in found if fac.lookup_task(task)[3] <= MOST_ACTIONS]
+
+
+def load_path(task, data, name):
+    """The path of a task's file in data/, or in the folder `data`."""
+    return Path(data) / task / name if data else fac.data_file(task, name)
+
+
+def load_expert(task, data):
+    """(expert, header, path) of a task."""
+    path = load_path(task, data, "expert.npz")
+    return *fac.load_model(path, ["expert"]), path
+
+
+def let_play(teacher, task, planning, workers, folder):
+    """Let a teacher's policy play its episodes [D8]; what any run has played before is read from
+    `folder`."""
+    about = {"data": fac.data_checksums(teacher.expert, teacher.replay), "seed": teacher.seed,
+             "episodes": teacher.config.expert_episodes, "planner": vars(planning),
+             "versions": fac.software()}
+    path = folder / f"{task}-{fac.zlib.crc32(json.dumps(about).encode()):08x}.npz"
+    if not path.exists():
+        found = fac.expert_episodes(teacher, task, planning, workers)
+        fac.write_npz(path, {"kind": "played", **about}, dict(zip(("obs", "action"), found)))
+    teacher.add(*fac.read_npz(path, ("played",))[1].values())
+
+
+def distil(args, config, out, seed, centralized):
+    """Distil a student of args.tasks into the folder `out`, or go on there; result. It's saved
+    after each of `marked` steps, too, as step-N.npz."""
+    teachers, plannings, out = {}, {}, Path(out)
+    start = load(args.start)[0] if args.start else None
+    with contextlib.ExitStack() as stack:
+        for task in args.tasks:
+            expert, header, replay, path = fac.load_data(argparse.Namespace(
+                task=task, expert=args.data and Path(args.data) / task, replay=None))
+            plannings[task] = fac.PlannerConfig(**fac.made_for(header, path))
+            teachers[task] = stack.enter_context(contextlib.closing(fac.Distiller(
+                expert, replay, config, 1 if centralized else None, seed)))
+        settings = {"seed": seed, "centralized": centralized, "distill": vars(config), "of": {
+            task: fac.data_checksums(of.expert, of.replay) for task, of in teachers.items()},
+            "start": start and fac.checksum(start.params.values()), "order": args.tasks}
+        distiller = stack.enter_context(contextlib.closing(MultitaskDistiller(
+            teachers, config, centralized, seed,
+            {step: out / f"step-{step}.npz" for step in marked(config.steps)}, settings, start)))
+        stack.enter_context(fac.locked(out))
+        if (path := out / "student.npz").exists():
+            _, before = load(path)
+            fac.same_settings({key: before.get(key) for key in settings}, settings, path)
+        for task, teacher in teachers.items():
+            if config.expert_episodes:
+                let_play(teacher, task, plannings[task], args.workers, out.parent / "played")
+        agents, count = distiller.student.config.num_agents, len(distiller.optimizer.vector)
+        print(f"{len(teachers)} tasks, {agents} agents, {count:,} weights; {config.steps:,} steps "
+              f"of {config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
+        curve, seconds, _ = fac.train_student(distiller, out, settings,
+                                              plannings[args.tasks[0]], args.workers)
+        save(path, distiller.student, settings)
+        distiller.refresh()
+        ranks = {task: fac.rank_results(of, 64, plannings[task].discount)[
+            "rank_correlation_returns"] for task, of in teachers.items()}
+    return {"tasks": args.tasks, "seed": seed, "centralized": centralized, "weights": count,
+            "num_agents": agents, "steps": config.steps, "seconds": round(seconds, 1),
+            "kl_reward": curve[-1][3], "kl_value": curve[-1][4], "rank_correlation_returns": ranks,
+            "out": str(out)}
+
+
+def marked(steps):
+    """The steps after which students are saved: MARKS of all."""
+    return [max(1, round(mark * steps)) for mark in MARKS]
+
+
+def read_config(args):
+    """The DistillConfig that the flags give; by default with a single student's steps a task."""
+    return fac.from_args(fac.DistillConfig, args, encoder_input="observation",
+                         steps=fac.DistillConfig.steps * len(args.tasks))
+
+
+def command_distill(args):
+    """distill: one student of many tasks."""
+    args.tasks = named(args.tasks) or small_tasks()
+    name = "multitask-centralized" if args.centralized else "multitask"
+    result = distil(args, read_config(args), args.out or f"runs/{name}-{args.seed}", args.seed,
+                    args.centralized)
+    ranks = result["rank_correlation_returns"]
+    fac.print_table([("rank correlation of G", *(f"H = {h}" for h in range(
+        len(ranks[args.tasks[0]])))), *((task, *(f"{x:.2f}" for x in own))
+                                        for task, own in ranks.items())])
+    print(f"{result['out']}/student.npz, distilled in {result['seconds']:.0f} s")
+    return result
+
+
+# ---------------------------------------------------------------------------------- evaluate
+
+def recorded(expert, header, path, episodes, seed):
+    """The returns of an expert's episodes: those in its record; else measured, in this process."""
+    planning = fac.PlannerConfig(**fac.made_for(header, path))
+    found, _ = fac.read_records(path).get(fac.record_key(expert, planning, seed), ([], {}))
+    return found[:episodes] if len(found) >= episodes else fac.evaluate(
+        expert, header["task"], planning, episodes, seed, 0, "evaluating the teacher")["returns"]
+
+
+def command_evaluate(args):
+    """evaluate: a multi-task student's returns in each of its tasks, beside its teachers'."""
+    student, header = load(args.model)
+    config = fac.from_dict(fac.DistillConfig, header.get("distill"), f"{args.model}: distill")
+    around, found = getattr(args, "PlannerConfig.prior") != "none", {}
+    for task in named(args.tasks) or student.dims:
+        fac.need(task in student.dims, f"--tasks: {task}: {args.model} is of "
+                 f"{', '.join(student.dims)}")
+        expert, own, path = load_expert(task, args.data)
+        fac.need(fac.checksum(expert.params.values()) in header["of"][task], f"{path}: another "
+                 f"expert than {args.model} was distilled from; name its folder with --data")
+        planning = fac.from_args(fac.PlannerConfig, args, **{
+            **fac.made_for(own, path), "horizon": config.horizon,
+            **(fac.STUDENT_PLANNING if around else {})})
+        found[task] = fac.evaluate(student.of_task(task, expert), task, planning, args.episodes,
+                                   args.seed, args.workers, task)
+        found[task]["teacher_returns"] = recorded(expert, own, path, args.episodes, args.seed)
+    rows = [[np.mean(of["returns"]), np.mean(of["teacher_returns"]), of["plan_ms_median"]]
+            for of in found.values()]
+    mean, teachers, _ = means = np.mean(rows, 0).tolist()
+    spread = [f" ± {np.std(of['returns']):.0f}" for of in found.values()]
+    fac.print_table([("task", "student", "teacher", "kept", "ms a decision"), *(
+        (task, f"{student:.0f}{std}", f"{teacher:.0f}", f"{student / max(teacher, 1e-9):.2f}",
+         f"{ms:.1f}") for task, std, (student, teacher, ms) in zip(
+            [*found, "mean"], [*spread, ""], [*rows, means]))])
+    return {"tasks": found, "episodes": args.episodes, "seed": args.seed, "return_mean": mean,
+            "teacher_mean": teachers, "kept": fac.return_kept(mean, teachers)}
+
+
+# ----------------------------------------------------------------------------------- latents
+
+def latents_of(student, data, seed, task, states):
+    """Latents (N, m, B) of a task's agents in states of its replay's held-out episodes."""
+    replay = fac.Replay(load_path(task, data, "replay.npz"))
+    fac.check_task(replay, task, replay.path)
+    _, rows = replay.starts(1, fac.DistillConfig.held_out, seed)
+    rng = fac.stream(seed, "latents of " + task)
+    obs, _ = replay.sequences(rng.permutation(rows)[:states], 1)
+    return student.of_task(task).encode(obs)
+
+
+def command_latents(args):
+    """latents: do agents' latents cluster by joint, and meet across tasks and robots?"""
+    student, header = load(args.model)
+    latents.need_plots(args.out)
+    fac.need(latents.comparisons(student.dims) and student.config.num_agents > 1, f"{args.model}: "
+             "expected a factored student of two walker tasks, or of one and one of hopper, found "
+             f"{student.config.num_agents} agents, {', '.join(student.dims)}")
+    seed = header.get("seed", 0)
+    found = latents.compare(functools.partial(latents_of, student, args.data, seed), student.dims,
+                            args.points, seed, args.out)
+    latents.print_tables(found)
+    print(args.out)
+    return {**found, "out": args.out}
+
+
+# --------------------------------------------------------------------------------- Figure 10
+
+CASES = {"Fac-TDMPC": False, "TD-MPC": True}  # centralized?
+AROUND = ", around the policy"
+TEACHER, POLICY = "teacher", "its policy alone"
+
+
+def play_marks(task, seed, case, settings, folder, data):
+    """Rows of a task's returns: of a student after each of `marked` steps, planning alone or around
+    its teacher's policy; or of the teacher; or of its policy alone."""
+    expert, header, path = load_expert(task, data)
+    episodes, steps = settings["episodes"], settings["steps"]
+    own = fac.made_for(header, path)
+    if case == TEACHER:
+        returns = recorded(expert, header, path, episodes, 0)
+        yield {"step": steps, **experiments.of_returns(returns, 0)}
+    elif case == POLICY:
+        planning = fac.PlannerConfig(**{**own, "prior": "policy", "iterations": 0})
+        yield {"step": steps, **experiments.measure(expert, task, planning, episodes)}
+    else:
+        planning = fac.PlannerConfig(**{**own, "horizon": settings["horizon"], **(
+            fac.STUDENT_PLANNING if case.endswith(AROUND) else {})})
+        for step in marked(steps):
+            student, _ = load(student_folder(folder, seed, case) / f"step-{step}.npz")
+            yield {"step": step, **experiments.measure(student.of_task(task, expert), task,
+                                                       planning, episodes)}
+
+
+def student_folder(folder, seed, case):
+    """Where figure10 leaves a student."""
+    return Path(folder) / f"{seed}" / case.removesuffix(AROUND)
+
+
+def over_tasks(rows, tasks):
+    """`experiments.curves` of runs, and before them the mean over tasks, seed by seed."""
+    found = experiments.curves(rows)
+    mean = {case: {step: np.mean([found[task][case][step] for task in tasks], 0).tolist()
+                   for step in points} for case, points in found[tasks[0]].items()}
+    return {f"mean of {len(tasks)} tasks": mean, **{task: found[task] for task in tasks}}
+
+
+def figure10_runs(args, config, made):
+    """A run for each task, seed and case. made: a number that tells students apart."""
+    cases = [(seed, case + prior) for seed in args.seeds for case in CASES
+             for prior in ("", AROUND)]
+    return [experiments.make_run(task, seed, case, made=made, steps=config.steps,
+                                 horizon=config.horizon, episodes=args.episodes)
+            for task in args.tasks for seed, case in (*cases, (0, TEACHER), (0, POLICY))]
+
+
+def command_figure10(args):
+    """figure10: returns against steps of both students, teachers' beside; latents."""
+    args.tasks = named(args.tasks) or small_tasks()
+    config = read_config(args)
+    latents.need_plots(args.picture)
+    for seed, (case, centralized) in itertools.product(args.seeds, CASES.items()):
+        with contextlib.redirect_stdout(sys.stderr):
+            distil(args, config, student_folder(args.students, seed, case), seed, centralized)
+    students = {seed: load(student_folder(args.students, seed, "Fac-TDMPC") / "student.npz")
+                for seed in args.seeds}
+    made = experiments.crc(config, students[args.seeds[0]][1]["of"])
+    runs = figure10_runs(args, config, made)
+    result = experiments.run_all(args, functools.partial(
+        play_marks, folder=args.students, data=args.data), runs)
+    fac.need(not result["failed"], f"{result['out']}: {result['failed']} runs failed")
+    done = experiments.finished(experiments.read_rows(result["out"]))
+    found = over_tasks({key: done[key] for key in map(experiments.key_of, runs)}, args.tasks)
+    experiments.draw_lines(args.picture, {
+        title: (cases, cases[TEACHER][config.steps][0]) for title, cases in found.items()},
+        "gradient step")
+    print_figure10(found, marked(config.steps))
+    compared, picture = {}, Path(args.picture).with_name(f"{Path(args.picture).stem}-latents.png")
+    for seed, (student, _) in students.items():
+        compared[seed] = latents.compare(functools.partial(
+            latents_of, student, args.data, seed), student.dims, 100, seed,
+            None if compared else picture)
+        latents.print_tables(compared[seed])
+    return {**result, "returns": found, "latents": compared, "picture": args.picture}
+
+
+def print_figure10(found, steps):
+    """A table for the mean and for each task: mean returns, over seeds, after these steps."""
+    for title, cases in found.items():
+        fac.print_table([(title, *(f"{step:,} steps" for step in steps)), *(
+            (case, *(experiments.cell(experiments.last({step: points[step]}, None)
+                                      if step in points else None) for step in steps))
+            for case, points in cases.items())])
+        print()
+
+
+# ------------------------------------------------------------------------------ command line
+
+def make_parser():
+    """The command line."""
+    parser = fac.Parser(prog="multitask.py", description="One factored student for many tasks and "
+                        "robots (section 5.7), each task taught by its own expert.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    positive = functools.partial(fac.natural, least=1)
+
+    def add(name, run, help, tasks="", model=False, **about):
+        sub = fac.add_command(commands, name, run, help, **about)
+        if tasks:
+            sub.add_argument("--tasks", nargs="+", default=[], metavar="TASK", help="any of: "
+                             f"{fac.task_names()} [{tasks}]")
+            sub.add_argument("--workers", type=fac.natural,
+                             help="processes that play episodes; 0: this one [cores]")
+        if model:
+            sub.add_argument("--model", required=True, help="distill's student.npz or step-N.npz")
+        else:
+            sub.add_argument("--steps", type=int, dest="DistillConfig.steps", metavar="INT", help=
+                             f"gradient steps in all [{fac.DistillConfig.steps} for each task]")
+            fac.add_config(sub, fac.DistillConfig, skip=("steps", "targets", "encoder_input"))
+        sub.add_argument("--data", help="folder with TASK/expert.npz and replay.npz [data]")
+        return sub.add_argument
+
+    small = f"experts in data/ of at most {MOST_ACTIONS} action dimensions"
+    option = add("distill", command_distill, "Distil many tasks' experts into one student.", small,
+                 epilog="Given again, a cut-off run goes on. What the policies play is kept "
+                 "beside --out, in played/, for other runs of the same seed.")
+    option("--seed", type=fac.natural, default=0, help="of distillation [0]")
+    option("--centralized", action="store_true", help="one agent, with the same encoder, about as "
+           "many weights, the same states")
+    option("--start", help="a student of other tasks to begin from, e.g. of all but the --tasks "
+           "here, to see what these learn from those")
+    option("--out", help="folder for the results [runs/multitask-SEED, "
+           "runs/multitask-centralized-SEED]")
+    option = add("evaluate", command_evaluate, "Plan with a student in each of its tasks, by "
+                 "default around its teacher's policy; with --prior none it plans alone.",
+                 "the student's", True)
+    option("--seed", type=fac.natural, default=0, help="of the episodes [0]")
+    option("--episodes", type=positive, default=20, help="of each task [20]")
+    fac.add_config(commands.choices["evaluate"], fac.PlannerConfig,
+                   skip=("action_repeat", "horizon"), **fac.STUDENT_PLANNING)
+    option = add("latents", command_latents, "Figure 10, middle and right: t-SNE of the walkers' "
+                 "latents, and of walker's and hopper's, by joint; silhouettes; a classifier of "
+                 "hip, knee and ankle that learned from one robot, tried on the other.", "", True)
+    option("--points", type=functools.partial(fac.natural, least=20), default=100,
+           help="states of each task [%(default)s]")
+    option("--out", default="latents.png", help="the picture [%(default)s]")
+    option = add("figure10", command_figure10, "Return against steps of the factored student and "
+                 "of a centralized one, each planning alone and around its teachers' policies; "
+                 "then latents.", small, epilog="The same command again makes what is missing.")
+    commands.choices["figure10"].set_defaults(start=None)
+    option("--seeds", nargs="+", type=fac.natural, default=[0, 1, 2], metavar="SEED",
+           help="of distillation [0 1 2]")
+    option("--episodes", type=positive, default=5, help="of each evaluation [5]")
+    option("--jobs", type=positive, default=fac.cores(),
+           help="tasks that are played at a time [one for each core]")
+    option("--students", default="runs/figure10", help="leave them in SEED/ there [%(default)s]")
+    option("--out", help="the CSV [data/results/figure10.csv]")
+    option("--picture", default=str(fac.DATA / "figures" / "figure10.png"), help="beside it "
+           "FIGURE-latents.png [data/figures/figure10.png]")
+    return parser
+
+
+def main(argv=None):
+    """Run the command line; returns the exit status."""
+    return fac.run_command(make_parser(), argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
