@@ -302,9 +302,8 @@ class Adam:
         self.m, self.v, self.t = np.zeros_like(self.vector), np.zeros_like(self.vector), 0
 
     def step(self, lr, clip=np.inf):
-        """params -= lr m_hat / (sqrt(v_hat) + eps) of the gradient, clipped to norm `clip`.
-
-        Sets the gradient to zero again; returns its norm."""
+        """params -= lr m_hat / (sqrt(v_hat) + eps) of the gradient, clipped to norm `clip`, which
+        is set to zero again; returns its norm."""
         length, beta1, beta2, eps = float(np.linalg.norm(self.gradient)), 0.9, 0.999, 1e-8
         if length > clip:
             self.gradient *= self.gradient.dtype.type(clip / (length + 1e-6))  # PyTorch's 1e-6
@@ -358,12 +357,11 @@ class WorldModel:
 
     def encode_backward(self, dz, tape, grads):
         """Walk `encode_features` back from dz (N, m, B): adds to `grads`, returns dx (1, F, B)."""
-        return backward(ENCODER, self.params, "_encoder", tape, dz.reshape(1, -1, dz.shape[-1]),
-                        grads)
+        dy = dz.reshape(1, -1, dz.shape[-1])
+        return backward(ENCODER, self.params, "_encoder", tape, dy, grads)
 
     def features(self, obs, z):
-        """What the trained encoder reads (1, F, B): observations (O, B), or the expert's latents z
-        of them (N, m, B) [D3]."""
+        """What it reads (1, F, B): observations (O, B), or the expert's latents z of them [D3]."""
         return z.reshape(1, -1, z.shape[-1]) if self.config.expert_latent_dim else obs[None]
 
     def next(self, z, a):
@@ -534,9 +532,8 @@ def divergences(heads, targets, config, divergence=soft_kl):
 
 
 def new_student(expert, config, seed):
-    """(Adam, student): a fresh student of an expert, and Adam on those of its weights that train.
-
-    What a student keeps of its expert are the expert's own arrays."""
+    """(Adam, student): a fresh student, and Adam on those of its weights that train; what it keeps
+    of its expert are the expert's own arrays."""
     student = WorldModel.create(config, stream(seed, "student"))
     frozen = {k: expert.params[k[len("_expert"):]] for k in student.params
               if k.startswith("_expert")}
@@ -570,8 +567,7 @@ def distill(expert, replay, config, num_agents=None, seed=0):
     """Algorithm 1: a factored student of an expert; yields it with each step's losses.
 
     replay: the dataset; `starts` are rows that H + 1 actions follow, `sequences` g_0 and these.
-    Part II's `Distiller` is this loop with pools of predictions, each for several steps [D1], more
-    states [D8] and credit [D9]."""
+    Part II's `Distiller` is this with pools of predictions [D1], more states [D8], credit [D9]."""
     agents = expert.config.dim_action if num_agents is None else num_agents
     sizes = student_config(expert.config, agents, config.encoder_input)
     optimizer, student = new_student(expert, sizes, seed)
@@ -686,7 +682,7 @@ class AgentPlanner:
         return draw_elite(elites, scores, self.rngs)
 
     def search(self, z, mean):
-        """MPPI from the latent z (N, m, 1) and a first mean (N, L, d), as `mppi` returns."""
+        """`mppi` from the latent z (N, m, 1) and a first mean (N, L, d)."""
         return mppi(self.returns(z), mean, self.config, self.rngs, self.proposals(z))
 
     def returns(self, z):
