@@ -347,7 +347,7 @@ def test_other_bad_commands_are_refused(tmp_path, files, arguments, parts):
 
 
 def test_a_task_without_data_says_what_to_do(tmp_path):
-    task = "cartpole-swingup"
+    task = "acrobot-swingup"
     refused(run("distill", "--task", task, cwd=tmp_path), f"train_expert.py --task {task}",
             "--expert", "holds")
     assert os.listdir(tmp_path) == []
