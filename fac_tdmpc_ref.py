@@ -159,7 +159,7 @@ def student_config(theirs, num_agents, encoder_input, policy=False):
         "expert_latent_dim": theirs.num_agents * theirs.latent_dim,
         "expert_enc_dim": theirs.enc_dim, "expert_mlp_dim": theirs.mlp_dim if policy else 0}
     return ModelConfig(dim_obs=theirs.dim_obs, dim_action=theirs.dim_action, num_agents=num_agents,
-                       mlp_dim=max(512 // max(1, num_agents), 50), **below)
+                       mlp_dim=max(theirs.mlp_dim // max(1, num_agents), 50), **below)
 
 
 def stream(seed, use, index=0):

@@ -407,9 +407,9 @@ def test_every_method_of_figure_4_learns_from_its_run_s_seed(replay, monkeypatch
     for case, settings in experiments.FIGURE4.items():
         weights = []
         for seed in (3, 3, 4):
-            distiller = baselines.distiller_of(case)(random_model(1, policy=True), replay,
-                                                     test_distill.CONFIG,
-                                                     settings.get("num_agents"), seed)
+            distiller = baselines.distiller_of(case)(
+                random_model(1, hidden=512, policy=True), replay, test_distill.CONFIG,
+                settings.get("num_agents"), seed)
             distiller.close()
             weights.append(distiller.optimizer.vector)
             assert distiller.seed == seed
