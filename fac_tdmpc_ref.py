@@ -887,12 +887,19 @@ def planning_numbers(sizes, config):
 # how a student plans that was taught around its expert's policy, if its file says nothing else
 STUDENT_PLANNING = {"prior": "policy", "max_std": 0.15, "samples": 32, "iterations": 3,
                     "output": "mean"}
+WELL_RANKED, WIDE = 0.75, 1.0  # see `search_width`
 
 
 def student_planning(config):
     """Settings of a PlannerConfig that students distilled with this config plan with [D9]: around
     the expert's policy, where they were taught around it; else as any model."""
     return STUDENT_PLANNING if config.policy_share else {}
+
+
+def search_width(rank):
+    """A student's first deviation, by its held-out rank correlation of G over H [D9]: who ranks
+    plans well finds better ones far from the policy; others only what their errors promise."""
+    return WIDE if rank >= WELL_RANKED else STUDENT_PLANNING["max_std"]
 
 
 def agent_order(sizes):
@@ -2283,7 +2290,8 @@ def command_distill(args):
         for model, config in ((expert, own), (distiller.student, planning)):
             check_memory(planning_numbers(model.config, config), config, model.config)
         teacher_of(distiller.student, planning)  # what is missing is missed now
-        result = distil_and_save(distiller, args, planning, header, out)
+        widens = around and getattr(args, "PlannerConfig.max_std") is None
+        result, planning = distil_and_save(distiller, args, planning, header, out, widens)
         obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
         both = (expert, own), (distiller.student, planning)
         result.update(evaluate_both(*both, record, args))
@@ -2313,8 +2321,9 @@ def load_data(args):
     return expert, header, replay, path
 
 
-def distil_and_save(distiller, args, planning, header, out):
-    """Algorithm 1 to its end; writes student, curve and configuration. Returns result's part."""
+def distil_and_save(distiller, args, planning, header, out, widens):
+    """Algorithm 1 to its end; writes student, curve and configuration. Returns result's part, and
+    the student's planning, with `search_width`'s deviation if it `widens`."""
     student, config, replay = distiller.student, distiller.config, distiller.replay
     sizes = student.config
     settings = {"task": args.task, "seed": args.seed,
@@ -2331,6 +2340,10 @@ def distil_and_save(distiller, args, planning, header, out):
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
     curve, seconds, before = train_student(distiller, out, settings, planning, args.workers)
+    ranks = rank_results(distiller, 256, planning.discount)
+    if widens:
+        width = search_width(ranks["rank_correlation_returns"][-1])
+        planning = dataclasses.replace(planning, max_std=width)
     save_model(out / "student.npz", student, {
         "kind": "student", **settings, "training": header.get("training", {}),
         "planner": {name: getattr(planning, name) for name in STUDENT_PLANNING}})
@@ -2338,9 +2351,9 @@ def distil_and_save(distiller, args, planning, header, out):
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
             "steps": config.steps, "seconds": round(seconds, 1), "seconds_total": before,
             "kl_reward": curve[-1][3], "kl_value": curve[-1][4],
-            **rank_results(distiller, 256, planning.discount), "out": str(out),
+            **ranks, "max_std": planning.max_std, "out": str(out),
             "picture": drawn(draw_curve, out / "curve.png", curve,
-                             f"{args.task}, seed {args.seed}")}
+                             f"{args.task}, seed {args.seed}")}, planning
 
 
 def evaluate_both(expert, student, record, args):

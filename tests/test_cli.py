@@ -399,6 +399,28 @@ def test_distill_prints_json_and_a_table(distilled):
     assert len(result["policy_returns"]) == 1 and f"{policy:.0f} ± 0" in table
     header, _ = fac.read_npz(folder / "student.npz", ("student",))
     assert header["planner"] == {**fac.STUDENT_PLANNING, "samples": 16, "iterations": 1}
+    assert result["max_std"] == fac.STUDENT_PLANNING["max_std"]
+
+
+@pytest.mark.parametrize("flags, rank, expected", [
+    ([], fac.WELL_RANKED, fac.WIDE), (["--plan-max-std", "0.3"], fac.WELL_RANKED, 0.3),
+    ([], fac.WELL_RANKED - 0.01, fac.STUDENT_PLANNING["max_std"])])
+def test_who_ranks_plans_well_searches_widely(
+        tmp_path, files, monkeypatch, capsys, flags, rank, expected):
+    found = {"rank_correlation_by_step": [1.0], "rank_correlation_returns": [0.0, rank],
+             "rank_correlation_returns_training": [1.0], "rank_correlation_returns_se": None,
+             "rank_correlation_episodes": 1}
+    monkeypatch.setattr(fac, "rank_results", lambda *_: found)
+    monkeypatch.setattr(fac, "evaluate_both", lambda expert, student, *_: (
+        planned.append(student[1].max_std), {})[1])
+    monkeypatch.setattr(fac, "time_both", lambda *_: {})
+    monkeypatch.setattr(fac, "report", lambda *_: None)
+    planned = []
+    arguments = distill_arguments(files, "--workers", "0", "--json", "--out", tmp_path / "out")
+    assert fac.main([*map(str, arguments), *flags]) == 0
+    header, _ = fac.read_npz(tmp_path / "out" / "student.npz", ("student",))
+    assert json.loads(capsys.readouterr().out)["max_std"] == expected
+    assert planned == [expected] and header["planner"]["max_std"] == expected
 
 
 def test_part_one_alone_distils_and_goes_on_from_its_end(tmp_path, files):
