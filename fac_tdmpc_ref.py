@@ -2526,7 +2526,9 @@ def make_parser():
 
     sub = add_command(commands, "distill", command_distill, "Distil a task's expert into a "
                       "factored student (Algorithm 1), then evaluate and time both with MPPI.",
-                      epilog="Given again, a cut-off run goes on; a finished one is evaluated.")
+                      epilog="Given again, a cut-off run goes on; a finished one is evaluated. "
+                      f"A student whose rank correlation of G is {WELL_RANKED} or more in held-out "
+                      f"states searches with --plan-max-std {WIDE}, unless told otherwise.")
     add = sub.add_argument
     add("--task", default="reacher-hard", help="one of: " + task_names())
     add("--seed", type=natural, default=0, help="of distillation [0]")
