@@ -354,6 +354,8 @@ def test_a_killed_run_goes_on_to_the_same_end(data, student, tmp_path, monkeypat
     (["evaluate", "--model", "{model}", "--data", "none"], ["none", "expert.npz", "no such file"]),
     (["evaluate", "--model", "{model}", "--episodes", "0"], ["episodes", "at least 1"])])
 def test_bad_input_is_one_line(capsys, data, student, flags, parts):
+    if flags[0] == "latents":
+        pytest.importorskip("matplotlib")
     values = {"data": data, "model": student[0] / "two" / "student.npz"}
     refused_here(capsys, [flag.format(**values) for flag in flags], *parts)
 
