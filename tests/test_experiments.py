@@ -1142,6 +1142,7 @@ def test_frames_hold_pictures_and_bars():
 
 @pytest.mark.parametrize("name, task", [("x.gif", "pendulum-swingup"), ("x.mp4", "reacher-easy")])
 def test_watch_writes_a_moving_picture(tmp_path, name, task):
+    pytest.importorskip("matplotlib")
     image = pytest.importorskip("PIL.Image")
     pytest.importorskip("imageio_ffmpeg" if name == "x.mp4" else "PIL")
     expert, sizes = tmp_path / "expert.npz", fac.lookup_task(task)[2:]
