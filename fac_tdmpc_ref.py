@@ -2290,8 +2290,7 @@ def command_distill(args):
         for model, config in ((expert, own), (distiller.student, planning)):
             check_memory(planning_numbers(model.config, config), config, model.config)
         teacher_of(distiller.student, planning)  # what is missing is missed now
-        widens = around and getattr(args, "PlannerConfig.max_std") is None
-        result, planning = distil_and_save(distiller, args, planning, header, out, widens)
+        result, planning = distil_and_save(distiller, args, planning, header, out)
         obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
         both = (expert, own), (distiller.student, planning)
         result.update(evaluate_both(*both, record, args))
@@ -2321,9 +2320,9 @@ def load_data(args):
     return expert, header, replay, path
 
 
-def distil_and_save(distiller, args, planning, header, out, widens):
+def distil_and_save(distiller, args, planning, header, out):
     """Algorithm 1 to its end; writes student, curve and configuration. Returns result's part, and
-    the student's planning, with `search_width`'s deviation if it `widens`."""
+    the student's planning, around the policy with `search_width`'s deviation if none is given."""
     student, config, replay = distiller.student, distiller.config, distiller.replay
     sizes = student.config
     settings = {"task": args.task, "seed": args.seed,
@@ -2341,7 +2340,7 @@ def distil_and_save(distiller, args, planning, header, out, widens):
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
     curve, seconds, before = train_student(distiller, out, settings, planning, args.workers)
     ranks = rank_results(distiller, 256, planning.discount)
-    if widens:
+    if planning.prior == "policy" and getattr(args, "PlannerConfig.max_std") is None:
         width = search_width(ranks["rank_correlation_returns"][-1])
         planning = dataclasses.replace(planning, max_std=width)
     save_model(out / "student.npz", student, {

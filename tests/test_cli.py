@@ -404,6 +404,7 @@ def test_distill_prints_json_and_a_table(distilled):
 
 @pytest.mark.parametrize("flags, rank, expected", [
     ([], fac.WELL_RANKED, fac.WIDE), (["--plan-max-std", "0.3"], fac.WELL_RANKED, 0.3),
+    (["--preset", "plain"], fac.WELL_RANKED, 2.0), (["--plan-prior", "none"], 0.0, 2.0),
     ([], fac.WELL_RANKED - 0.01, fac.STUDENT_PLANNING["max_std"])])
 def test_who_ranks_plans_well_searches_widely(
         tmp_path, files, monkeypatch, capsys, flags, rank, expected):
