@@ -673,8 +673,7 @@ class AgentPlanner:
             self.rngs = [np.random.Generator(np.random.SFC64(seed)) for seed in seeds]
 
     def plan(self, z, prior=None):
-        """z (N, m, 1) -> first actions (N, d). The mean, moved on by one, starts the next plan,
-        unless this has a `prior` (N, L, d) [D9]."""
+        """z (N, m, 1) -> actions (N, d), from a prior (N, L, d) [D9], or the last mean moved on."""
         mean, elites, scores = self.search(z, self.mean if prior is None else prior)
         self.mean = np.concatenate([mean[:, 1:], np.zeros_like(mean[:, :1])], 1)
         if self.config.output == "mean" or not self.config.iterations:
@@ -1635,10 +1634,15 @@ def import_dm_control(render=False):
 GYM = "gym:"  # before a task's ID in Gymnasium
 
 
+def is_gym(task):
+    """Whether a task is one of Gymnasium's."""
+    return str(task).startswith(GYM)
+
+
 def make_robot(task, action_repeat=None):
     """The robot of a task: dm_control's, an `Environment`, or data/gym_robot.py's of gym:ID."""
     repeat = task_repeat(task) if action_repeat is None else action_repeat
-    if not str(task).startswith(GYM):
+    if not is_gym(task):
         return Environment(task, repeat)
     if str(DATA) not in sys.path:
         sys.path.append(str(DATA))
@@ -1652,12 +1656,12 @@ def make_robot(task, action_repeat=None):
 
 def task_repeat(task):
     """A task's control steps a decision, where a file or a setting names no others."""
-    return 1 if str(task).startswith(GYM) else ACTION_REPEAT
+    return 1 if is_gym(task) else ACTION_REPEAT
 
 
 def task_steps(task, config):
     """T: decisions in an episode of a task, at most, with the action repeat of a PlannerConfig."""
-    robot = make_robot(task, config.action_repeat) if str(task).startswith(GYM) else config
+    robot = make_robot(task, config.action_repeat) if is_gym(task) else config
     return robot.episode_steps
 
 
@@ -1672,7 +1676,7 @@ class Environment:
     def __init__(self, task, action_repeat=ACTION_REPEAT, render=False):
         self.action_repeat, self.episode_steps = action_repeat, episode_steps(action_repeat)
         domain, name, self.dim_obs, self.dim_action = lookup_task(task)
-        need(not str(task).startswith(GYM), f"{task}: distill, evaluate and train_expert.py play "
+        need(not is_gym(task), f"{task}: distill, evaluate and train_expert.py play "
              "Gymnasium's; expected one of dm_control's here")
         suite, control, reacher = import_dm_control(render)
         if domain == "reacher":
@@ -1730,10 +1734,16 @@ def task_names():
 def lookup_task(task):
     """(domain, name, dim O, dim A) of a task; UserError with the nearest name otherwise."""
     task = str(task)
-    if task.startswith(GYM):
-        robot = make_robot(task)
-        return *task.split(":", 1), robot.dim_obs, robot.dim_action
+    if is_gym(task):
+        return *task.split(":", 1), *gym_sizes(task)
     return *task.split("-", 1), *(TASKS[task] if task in TASKS else suite_sizes(task))
+
+
+@functools.cache
+def gym_sizes(task):
+    """(dim O, dim A) of a task of Gymnasium's, from its spaces; UserError: it can't be made."""
+    robot = make_robot(task)
+    return robot.dim_obs, robot.dim_action
 
 
 @functools.cache
@@ -1896,8 +1906,8 @@ def made_for(header, where):
         settings = {name: settings[name] for name in names if name in settings}
         from_dict(PlannerConfig, settings, f"{there}: {group}")
         found.update(settings)
-    if "action_repeat" in header or str(header.get("task")).startswith(GYM):
-        found["action_repeat"] = header.get("action_repeat", 1)
+    if "action_repeat" in header or is_gym(header.get("task")):
+        found["action_repeat"] = header.get("action_repeat", task_repeat(header.get("task")))
     from_dict(PlannerConfig, found, there)
     return found
 

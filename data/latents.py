@@ -117,5 +117,4 @@ def print_tables(found):
 def need_plots(path):
     """UserError, before the work, if no picture can be made there, or scikit-learn is missing."""
     look.pyplot_for(path)
-    with fac.optional("scikit-learn", "experiments"):
-        import sklearn  # noqa: F401
+    look.need_sklearn()

@@ -138,6 +138,12 @@ def pyplot_for(path):
 
 
 NOISE = fac.DistillConfig.noise_std  # around what is done, for the additive ceiling
+def need_sklearn():
+    """UserError, before the work, if scikit-learn is missing."""
+    with fac.optional("scikit-learn", "experiments"):
+        import sklearn  # noqa: F401
+
+
 SMOOTH = 10  # decisions over which a change of the return counts
 
 
@@ -150,9 +156,9 @@ def t_sne(x):
 def clusters(z, rng, points):
     """Latents (N, m, B) of some states as points: t-SNE and PCA, (n, 2) each, their joints (n,),
     and the silhouette by joint and by shuffled joints."""
-    with fac.optional("scikit-learn", "experiments"):
-        from sklearn.decomposition import PCA
-        from sklearn.metrics import silhouette_score
+    need_sklearn()
+    from sklearn.decomposition import PCA
+    from sklearn.metrics import silhouette_score
     chosen = z[:, :, rng.choice(z.shape[2], min(points, z.shape[2]), replace=False)]
     x = chosen.swapaxes(1, 2).reshape(-1, z.shape[1])
     joints = np.repeat(np.arange(len(z)), chosen.shape[2])
@@ -206,8 +212,7 @@ def command_figure9(args):
     """figure9: latents by joint, and what each joint contributes in the best and worst episode."""
     model, header, task = open_model(args, kinds=["student"])
     plt, began = pyplot_for(args.out), time.time()
-    with fac.optional("scikit-learn", "experiments"):
-        import sklearn  # noqa: F401  (missed before the episodes are played)
+    need_sklearn()
     config = fac.PlannerConfig(**fac.made_for(header, args.model))
     most = config.episode_steps - SMOOTH
     fac.need(model.config.latent_dim > 1 and config.horizon < most,
@@ -374,7 +379,7 @@ def open_model(args, **kinds):
     """(model, header, task) that --model, of `load_model`'s kinds, and --task name."""
     model, header = fac.load_model(args.model, **kinds)
     fac.need(task := args.task or header.get("task"), f"{args.model}: header: no task; pass --task")
-    fac.need(not str(task).startswith(fac.GYM), f"{task}: expected a task of dm_control, whose "
+    fac.need(not fac.is_gym(task), f"{task}: expected a task of dm_control, whose "
              "episodes are equally long, and which draws; distill and evaluate play this one")
     fac.check_task(model.config, task, args.model)
     return model, header, task

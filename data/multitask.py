@@ -11,7 +11,6 @@ import argparse
 import contextlib
 import functools
 import itertools
-import json
 import sys
 from pathlib import Path
 
@@ -62,7 +61,7 @@ def let_play(teacher, task, planning, workers, folder):
     about = {"data": fac.data_checksums(teacher.expert, teacher.replay), "seed": teacher.seed,
              "episodes": teacher.config.expert_episodes, "planner": vars(planning),
              "versions": fac.software()}
-    path = folder / f"{task}-{fac.zlib.crc32(json.dumps(about).encode()):08x}.npz"
+    path = folder / f"{task}-{experiments.crc(about):08x}.npz"
     if not path.exists():
         found = fac.expert_episodes(teacher, task, planning, workers)
         fac.write_npz(path, {"kind": "played", **about}, dict(zip(("obs", "action"), found)))
