@@ -377,22 +377,21 @@ def test_a_robot_of_mujoco_with_two_joints_is_learned_and_distilled(tmp_path, ca
 
 
 def test_pendulum_is_learned_in_a_minute_and_distilled(tmp_path, capsys):
-    """4,000 decisions, narrow networks: -265 over 20 episodes where this was written, -279 over 10
-    its student's of one agent, at random -1,360; the bound leaves room for others' rounding."""
+    """4,800 decisions and narrow networks: -207, its student of one agent -204; at random -1,360."""
     out = tmp_path / "expert"
     assert train_expert.main([
-        "--task", "gym:Pendulum-v1", "--steps", "4000", "--seed-decisions", "800", "--std-steps",
+        "--task", "gym:Pendulum-v1", "--steps", "4800", "--seed-decisions", "800", "--std-steps",
         "2400", "--updates-per-step", "0.6", "--lr", "2e-3", "--latent-dim", "8", "--enc-dim", "32",
         "--mlp-dim", "64", "--batch-size", "64", "--plan-samples", "32", "--plan-iterations", "2",
         "--plan-pi-trajs", "8", "--evaluate-every", "99999", "--evaluate-episodes", "1",
-        "--episodes", "10", "--workers", "1", "--out", str(out), "--json"]) == 0
+        "--episodes", "20", "--workers", "1", "--out", str(out), "--json"]) == 0
     found = last(capsys)
-    assert found["return_mean"] > -600 and found["updates"] == 2400
+    assert found["return_mean"] > -300 and found["updates"] == 2880
     expert, header = fac.load_model(out / "expert.npz")
-    config = fac.DistillConfig(steps=1000, batch_size=16, expert_episodes=0, policy_share=0)
+    config = fac.DistillConfig(steps=1500, batch_size=16, expert_episodes=0)
     with contextlib.closing(fac.Distiller(expert, fac.Replay(out / "replay.npz"), config,
                                           latent_dim=16, enc_dim=32, mlp_dim=64)) as distiller:
         list(distiller.run())
     planning = fac.PlannerConfig(**{**fac.made_for(header, out), "samples": 64, "iterations": 3})
-    returns = fac.evaluate(distiller.student, "gym:Pendulum-v1", planning, 10, 0, 0)["returns"]
-    assert distiller.student.config.num_agents == 1 and -600 < np.mean(returns) < 0
+    returns = fac.evaluate(distiller.student, "gym:Pendulum-v1", planning, 20, 0, 0)["returns"]
+    assert distiller.student.config.num_agents == 1 and -300 < np.mean(returns) < 0
