@@ -11,8 +11,8 @@ from tables import deviation, markdown, of_returns  # noqa: E402
 
 EVALUATION_SEEDS = (0, 1)
 MEASURED = ("rank_correlation", "plan_ms")  # what a row keeps
-HEADS = ("student", "kept", "kept, evaluation seed 1", "speed-up, one core",
-         "rank correlation of G, H = 0 / last", "minutes")
+HEADS = ("seeds", "student", "kept, evaluation seeds 0 / 1", "least kept",
+         "speed-up, one core", "rank correlation of G, H = 0 / last", "minutes")
 FLAGS = {"samples": "plan-samples", "iterations": "plan-iterations", "num_agents": "num-agents"}
 
 
@@ -47,13 +47,10 @@ def mean_and_spread(values, spread):
 
 
 def kept(rows):
-    """The student's mean return by its expert's: over all seeds (a ratio of means), and of each."""
-    def ratio(rows):
-        return fac.return_kept(*(np.mean([np.mean(json.loads(row[key])) for row in rows])
-                                 for key in ("returns", "expert_returns")))
-    found = [ratio(rows), *(ratio([row]) for row in rows)]
-    whole, *each = ("-" if x is None else f"{x:.2f}" for x in found)
-    return whole if len(rows) == 1 else f"{whole} ({' / '.join(each)})"
+    """The students' mean return by their expert's, a ratio of means over rows; NaN: nothing."""
+    found = fac.return_kept(*(np.mean([np.mean(json.loads(row[key])) for row in rows])
+                              for key in ("returns", "expert_returns")))
+    return np.nan if found is None else found
 
 
 def measured(rows, of):
@@ -65,11 +62,12 @@ def cells(rows):
     """A preset's cells of the table, of {evaluation seed: rows by seed}."""
     if not all(rows[seed] for seed in EVALUATION_SEEDS):
         return ["-"] * len(HEADS)
-    first = rows[0]
+    first, students = rows[0], sum(rows.values(), [])
     faster = measured(first, lambda x: x["plan_ms_expert"] / x["plan_ms_student_in_process"])
     ranks = (measured(first, lambda x, h=h: x["rank_correlation_returns"][h]) for h in (0, -1))
-    return [mean_and_spread([float(row["return_mean"]) for row in first], deviation),
-            *(kept(rows[s]) for s in EVALUATION_SEEDS), f"{faster:.1f}",
+    return [len(first), mean_and_spread([float(row["return_mean"]) for row in first], deviation),
+            " / ".join(f"{kept(rows[seed]):.2f}" for seed in EVALUATION_SEEDS),
+            f"{min(kept([row]) for row in students):.2f}", f"{faster:.1f}",
             " / ".join(f"{x:.2f}" for x in ranks),
             f"{np.mean([float(row['minutes']) for row in first]):.0f}"]
 

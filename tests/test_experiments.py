@@ -1030,17 +1030,18 @@ def test_the_table_of_students_has_a_line_for_each_budget_and_columns_for_each_p
     assert row["expert"] == "125 ± 75" and row["its policy alone"] == "100 ± 10"  # over episodes
     assert row["student, default"] == "88 ± 18"  # 100 and 75: over seeds, n - 1
     assert row["speed-up, one core, default"] == "4.5"
-    assert row["kept, default"] == "0.70 (0.80 / 0.60)"
-    assert row["kept, evaluation seed 1, default"] == "0.90 (1.00 / 0.80)"
+    assert row["kept, evaluation seeds 0 / 1, default"] == "0.70 / 0.90"
+    assert row["least kept, default"] == "0.60"  # of each seed's two: 0.80, 0.60; 1.00, 0.80
     assert row["rank correlation of G, H = 0 / last, default"] == "0.90 / 0.50"
-    assert row["kept, paper"] == "0.40" and row["minutes, default"] == "6"
+    assert row["kept, evaluation seeds 0 / 1, paper"] == "0.40 / 0.32"
+    assert (row["seeds, default"], row["seeds, paper"], row["minutes, default"]) == ("2", "1", "6")
     assert row["authors' logs: 100% TD-MPC / Fac-TDMPC"] == "836 / 809"
     other = dict(zip(heads, second))
-    assert other["MPPI"] == "512 x 6" and other["kept, paper"] == "-"
+    assert other["MPPI"] == "512 x 6" and other["least kept, paper"] == "-"
     assert list(result) == ["walker-run, 128 x 4", "walker-run, 512 x 6"]
     write_student_rows(tmp_path / "none.csv", policy=())  # an expert without a policy
     _, text = experiments.report_students("students", tmp_path / "none.csv", tmp_path)
-    assert "| 125 ± 75 | - | 88 ± 18 |" in text
+    assert "| 125 ± 75 | - | 2 | 88 ± 18 |" in text
 
 
 def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkeypatch):

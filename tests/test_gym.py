@@ -377,7 +377,7 @@ def test_a_robot_of_mujoco_with_two_joints_is_learned_and_distilled(tmp_path, ca
 
 
 def test_pendulum_is_learned_in_a_minute_and_distilled(tmp_path, capsys):
-    """4,800 decisions and narrow networks: -207, its student of one agent -204; at random -1,360."""
+    """4,800 decisions, narrow networks: -207, its student of one agent -204; at random -1,360."""
     out = tmp_path / "expert"
     assert train_expert.main([
         "--task", "gym:Pendulum-v1", "--steps", "4800", "--seed-decisions", "800", "--std-steps",
