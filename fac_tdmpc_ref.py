@@ -2558,6 +2558,9 @@ def make_parser():
     add("--episodes", type=positive, default=20, help="evaluation episodes [20]")
     add("--workers", type=natural, help="processes that play episodes; 0: this one [cores]")
     add_config(sub, DistillConfig)
+    for flag, name in (("--own-episodes", "expert_episodes"), ("--own-share", "played_share")):
+        add(flag, dest=f"DistillConfig.{name}", type=int, choices=[0],  # of earlier scripts
+            help=argparse.SUPPRESS)
     add_config(sub, PlannerConfig, "How the student plans; the expert does with its own defaults",
                "plan-", ("horizon", "action_repeat"), **STUDENT_PLANNING)
 

@@ -219,6 +219,14 @@ def test_flags_go_before_the_preset(monkeypatch):
     assert (config.steps, config.kl, config.batch_size) == (7, "forward", 512)
 
 
+def test_earlier_scripts_may_say_that_students_play_no_episodes(monkeypatch, capsys):
+    config, *_ = configs_of(monkeypatch, "distill", "--own-episodes", 0, "--own-share", 0)
+    assert (config.expert_episodes, config.played_share) == (0, 0)
+    with pytest.raises(SystemExit, match="2"):
+        fac.main(["distill", "--own-episodes", "48"])
+    assert "--own-episodes: invalid choice" in capsys.readouterr().err
+
+
 def another_value(f):
     """Flags that set a field to something else, and that value."""
     flag = f.name.replace("_", "-")
