@@ -2267,6 +2267,11 @@ def software():
             "mujoco": importlib.metadata.version("mujoco")}
 
 
+def recorded_returns(path, model, config, seed):
+    """(returns, the `software` they are of) that `record_returns` kept; ([], {}): none."""
+    return read_records(path).get(record_key(model, config, seed), ([], {}))
+
+
 def record_returns(path, model, config, seed, returns):
     """Keep the returns that `evaluate` gave beside the model's file, unless it holds more, of the
     same versions."""
@@ -2294,7 +2299,7 @@ def command_distill(args):
     planning = dataclasses.replace(planning, horizon=config.horizon)
     distiller_class = PlainDistiller if args.plain else Distiller
     out = Path(args.out or f"runs/{args.task}-{args.seed}")
-    record = read_records(path).get(record_key(expert, own, args.eval_seed), ([], {}))
+    record = recorded_returns(path, expert, own, args.eval_seed)
     with contextlib.closing(distiller_class(expert, replay, config, args.num_agents,
                                             args.seed)) as distiller, locked(out):
         for model, config in ((expert, own), (distiller.student, planning)):

@@ -138,7 +138,7 @@ def command_distill(args):
 def recorded(expert, header, path, episodes, seed):
     """The returns of an expert's episodes: those in its record; else measured, in this process."""
     planning = fac.PlannerConfig(**fac.made_for(header, path))
-    found, _ = fac.read_records(path).get(fac.record_key(expert, planning, seed), ([], {}))
+    found, _ = fac.recorded_returns(path, expert, planning, seed)
     return found[:episodes] if len(found) >= episodes else fac.evaluate(
         expert, header["task"], planning, episodes, seed, 0, "evaluating the teacher")["returns"]
 
