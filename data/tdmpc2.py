@@ -13,6 +13,7 @@ any pair is one such draw, and one that stays gives the same plan and the same t
 """
 import dataclasses
 import itertools
+import math
 import sys
 from pathlib import Path
 
@@ -30,6 +31,7 @@ cartpole-balance cartpole-balance_sparse cartpole-swingup cartpole-swingup_spars
 finger-spin finger-turn_easy finger-turn_hard fish-swim hopper-stand hopper-hop - - - - - - -
 reacher-easy reacher-hard - -""".split()
 KNOWN = {30: MT30, 80: MT30 + 50 * ["-"]}
+MAX_WEIGHTS = 1 << 26  # the public models but the largest, of 317 million
 GROUP = 8  # features of a softmax in SimNorm
 BINS = 10  # two-hot's bins are spread evenly over symlog's values from minus this to this
 ELSEWHERE = "expected what TD-MPC2's public code saves of a model of many tasks, for state input"
@@ -187,9 +189,12 @@ class Checkpoint:
             self.names = [*names] or KNOWN.get(tasks, [])
             need(len(self.names) == tasks, f"{EMBEDDING}: of {tasks} tasks, for which there are "
                  f"{len(self.names)} names; give --teacher-tasks all, in its order, - for others")
+            self.known = [name for name in self.names if name != "-"]
             for key, value in state.items():
                 need(key in expected or not import_expert.is_weight(value) or
                      key.startswith(BESIDE), f"{import_expert.short(key)}: unknown; {ELSEWHERE}")
+            need((count := sum(map(math.prod, expected.values()))) <= MAX_WEIGHTS, f"expected at "
+                 f"most {MAX_WEIGHTS} weights, found {count}")
             weights = {key: import_expert.as_float32(key, state.get(key), shape, ELSEWHERE)
                        for key, shape in expected.items()}
         self.embedding, self.masks = (weights.pop(key, None) for key in (EMBEDDING, MASKS))
@@ -203,18 +208,19 @@ class Checkpoint:
     def teacher(self, task):
         """An expert in one of the tasks, whose weights it shares but for those that read what is
         the task's, or its robot's: observations, actions, embedding. UserError: it can't be."""
-        known = [name for name in self.names if name != "-"]
-        need(task in known, f"{self.path}: knows {', '.join(known)}, not {task}; name some with "
-             "--tasks, or what it knows with --teacher-tasks")
+        need(task in self.known, f"{self.path}: knows {', '.join(self.known)}, not {task}; "
+             "name some of these with --tasks, or what it knows with --teacher-tasks")
         index, (*_, dim_obs, dim_action) = self.names.index(task), fac.lookup_task(task)
         wide, widest, E = self.sizes.dim_obs, self.sizes.dim_action, self.task_dim
-        acts = int((np.ones(dim_action) if self.masks is None else self.masks[index]).sum())
-        need(dim_obs <= wide and dim_action == acts <= widest, f"{self.path}: task {index}: reads "
-             f"up to {wide} features and has {acts} actions of {widest}; {task} has ({dim_obs}, "
-             f"{dim_action}); give --teacher-tasks in the model's order")
+        acts = np.arange(widest) < dim_action  # the older layout has no masks
+        mask = acts if self.masks is None else self.masks[index]
+        need(dim_obs <= wide and dim_action <= widest and np.array_equal(mask, acts),
+             f"{self.path}: task {index}: reads up to {wide} features and has {int(mask.sum())} of "
+             f"{widest} actions; {task} has ({dim_obs}, {dim_action}); give --teacher-tasks in the "
+             "model's order")
         embedding = self.embedding[index]
-        length = np.linalg.norm(embedding)  # TD-MPC2's is 1 at most where it's looked up
-        embedding = embedding / (length + fac.F32(1e-7)) if length > 1 else embedding
+        if (length := np.linalg.norm(embedding)) > 1:  # as TD-MPC2 does where it looks one up
+            embedding = embedding / (length + 1e-7)
         params = Networks(self.params)
         for name in LAST:
             before, own = (wide, dim_obs) if name == "_encoder" else [self.sizes.latent_dim] * 2
