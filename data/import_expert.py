@@ -164,9 +164,10 @@ def read_pt(path):
 def read_pickle(data, members, byteorder):
     """The dict that a state dict's pickle describes, built opcode by opcode; nothing is called.
 
-    Values are None, bool, int, float, str, tuple, list, dict, Global, Storage, and arrays that are
-    views of a member's bytes. An opcode makes one at most, so `data` bounds them all; types are
-    compared before anything is done to a value, only str and int are hashed, and nothing recurs.
+    Values are None, bool, int, float, str, tuple, list, dict, Global, Storage, Unread, and arrays
+    that are views of a member's bytes. An opcode makes one at most, so `data` bounds them all;
+    types are compared before anything is done to a value, only str and int are hashed, and nothing
+    recurs.
     """
     need(len(data) <= MAX_HEADER, f"has {len(data)} bytes, more than {MAX_HEADER}")
     stack, below, memo = [], [], {}  # below: the stacks beneath each MARK

@@ -55,6 +55,8 @@ def load_path(task, data, name):
 
 def read_teacher(args):
     """The Checkpoint that --teacher names, or None."""
+    fac.need(args.teacher or not (args.teacher_tasks or getattr(args, "collect", None)),
+             "--teacher-tasks and --collect are for --teacher FILE; experts in data/ have replays")
     return Checkpoint(args.teacher, args.teacher_tasks) if args.teacher else None
 
 
@@ -162,8 +164,6 @@ def read_config(args):
 def command_distill(args):
     """distill: one student of many tasks."""
     checkpoint = read_teacher(args)
-    fac.need(checkpoint or not args.collect, "--collect: experts in data/ have replays; it's for "
-             "--teacher")
     args.tasks = named(args.tasks) or (checkpoint.known if checkpoint else small_tasks())
     name = "multitask-centralized" if args.centralized else "multitask"
     result = distil(args, read_config(args), args.out or f"runs/{name}-{args.seed}", args.seed,

@@ -511,6 +511,7 @@ HOSTILE = {
     "half an item": (b"}(" + text("a") + b"u", "sets other items"),
     "a tuple as key": (b"})Ns", "sets other items"),
     "a call of a storage": (named("torch.FloatStorage") + b")R", "calls something"),
+    "a call of a dtype": (named("torch.float32") + b")R", "calls something"),
     "a call of a dict": (b"})R", "calls something"),
     "a call with a dict": (named("collections.OrderedDict") + b"}R", "calls something"),
     "OrderedDict of items": (named("collections.OrderedDict") + b")\x85R", "calls something"),
