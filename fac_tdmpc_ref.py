@@ -42,7 +42,6 @@ import dataclasses
 import functools
 import zlib
 from collections import defaultdict
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -68,7 +67,7 @@ class Settings:
         check_settings(self)
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class ModelConfig(Settings):
     """Sizes of a world model. Raises UserError if the agents don't share the actions evenly."""
     dim_obs: int = field(0, "O: observation features", least=1)
@@ -88,7 +87,7 @@ class ModelConfig(Settings):
         return self.dim_action // self.num_agents
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class PlannerConfig(Settings):
     """MPPI. Raises UserError for values that can't plan."""
     samples: int = field(128, "S: sequences drawn at once [D5]", paper=512, least=1, most=10 ** 6)
@@ -119,7 +118,7 @@ class PlannerConfig(Settings):
         return self.elites or max(1, self.samples // 8)
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class DistillConfig(Settings):
     """Algorithm 1. `--preset paper` takes each field's paper value."""
     steps: int = field(14_000, "gradient steps (section 5.1: 10^5) [D1]", paper=100_000, least=1)
@@ -169,8 +168,7 @@ def stream(seed, use, index=0):
 
 # ==== 2. Layers: each forward beside its backward =====================================
 
-# The networks of TD-MPC as layer kinds. A layer's place is its index in the official state
-# dict: layer 3 of the first Q is `_Q1.3.weight`, `_Q1.3.bias`.
+# TD-MPC's networks as layer kinds. Layer 3 of the first Q is `_Q1.3.weight` in its state dict.
 ENCODER = ("linear", "elu", "linear")
 MLP = ("linear", "elu", "linear", "elu", "linear")
 QNET = ("linear", "norm", "tanh", "linear", "elu", "linear")
@@ -244,6 +242,8 @@ def norm_backward(dy, x, g):
 
 def forward(kinds, params, name, x, tape=None):
     """Run a network on x (N, in, B). A tape (list) keeps x and every layer's output."""
+    if hasattr(params, "forward"):  # a client's frozen networks, of layers of their own
+        return params.forward(name, x, tape)
     if tape is not None:
         tape.append(x)
     for i, kind in enumerate(kinds):
@@ -260,8 +260,9 @@ def forward(kinds, params, name, x, tape=None):
 def backward(kinds, params, name, tape, dy, grads):
     """Walk `forward` back: adds parameter gradients to `grads` (None: not wanted), returns dx.
 
-    Uses the tape up: an activation's y, which only its own backward still reads, becomes its dx.
-    """
+    Uses the tape up: an activation's y, which only its own backward still reads, becomes its dx."""
+    if hasattr(params, "backward"):
+        return params.backward(name, tape, dy)
     for i in reversed(range(len(kinds))):
         kind, x, y = kinds[i], tape[i], tape[i + 1]
         if kind == "linear" and grads is None:
@@ -1385,12 +1386,14 @@ def sample_blocks(sizes, samples):
 
 
 class FastPlanner(AgentPlanner):
-    """`AgentPlanner` with `Returns`, unless its config says plain; UserError: no finite G."""
+    """`AgentPlanner` with `Returns`, unless its config says plain, or it can't know a client's
+    networks. UserError: no finite G."""
 
     def __init__(self, model, config):
         keep_memory()
         super().__init__(model, config)
-        self.fast = None if config.returns == "plain" else Returns(model)
+        plain = config.returns == "plain" or hasattr(model.params, "forward")
+        self.fast = None if plain else Returns(model)
 
     def returns(self, z):
         return self.fast.start(z, self.config) if self.fast else super().returns(z)

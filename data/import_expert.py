@@ -48,7 +48,8 @@ MAX_RANK = 8
 MAX_NOISE = 0.5  # largest deviation of the noise on collected actions
 LEAST_EPISODES = 10  # distill holds out one in 10
 RESAVE = "torch.load it where it was made and torch.save its state_dict() alone"
-ELSEWHERE = "only TD-MPC's official state dicts, for state input, can be imported"
+ELSEWHERE = ("only TD-MPC's official state dicts, for state input, can be imported; TD-MPC2's of "
+             "many tasks is for data/multitask.py distill --teacher")
 
 
 def short(text):
@@ -163,9 +164,10 @@ def read_pt(path):
 def read_pickle(data, members, byteorder):
     """The dict that a state dict's pickle describes, built opcode by opcode; nothing is called.
 
-    Values are None, bool, int, float, str, tuple, list, dict, Global, Storage, and arrays that are
-    views of a member's bytes. An opcode makes one at most, so `data` bounds them all; types are
-    compared before anything is done to a value, only str and int are hashed, and nothing recurs.
+    Values are None, bool, int, float, str, tuple, list, dict, Global, Storage, Unread, and arrays
+    that are views of a member's bytes. An opcode makes one at most, so `data` bounds them all;
+    types are compared before anything is done to a value, only str and int are hashed, and nothing
+    recurs.
     """
     need(len(data) <= MAX_HEADER, f"has {len(data)} bytes, more than {MAX_HEADER}")
     stack, below, memo = [], [], {}  # below: the stacks beneath each MARK
@@ -280,7 +282,11 @@ def rebuild_tensor(storage, offset, size, stride, _grad, _hooks, metadata=None):
 
 FUNCTIONS = {"collections OrderedDict": (dict, 0),  # and how many arguments they take
              "torch._utils _rebuild_tensor_v2": (rebuild_tensor, 6, 7),
-             "torch._utils _rebuild_parameter": (lambda tensor, _grad, _hooks: tensor, 3)}
+             "torch._utils _rebuild_parameter": (lambda tensor, _grad, _hooks: tensor, 3),
+             # what tensordict, and TD-MPC2 with it, leaves beside weights
+             "torch._utils _rebuild_meta_tensor_no_storage": (lambda *_: Unread("no values"), 4),
+             "torch float32": (None,), "torch Size": (lambda size: size, 1),
+             "torch device": (lambda *where: where, 1, 2)}
 
 
 # ---------------------------------------------------------------------------- .safetensors
@@ -386,9 +392,9 @@ FIRST = "_encoder.0.weight"
 WRAPPERS = re.compile(r"(?:(?<=\.)|^)(?:_orig_mod|module)\.")  # torch.compile, data parallel
 
 
-def state_dict(found):
-    """The weights in what a file holds, {name: value}: of all dicts in it, those beside FIRST. What
-    stands before that is taken off all; TD-MPC's `model_target` and others don't count."""
+def state_dict(found, first=FIRST):
+    """The weights in what a file holds, {name: value}: of all dicts in it, those beside `first`.
+    What stands before that is taken off all; TD-MPC's `model_target` and others don't count."""
     flat, waiting, entries = {}, [("", found)], 0
     while waiting:
         prefix, values = waiting.pop()
@@ -401,7 +407,7 @@ def state_dict(found):
             elif len(key) < MAX_NAME:
                 need(flat.setdefault(name := WRAPPERS.sub("", key), value) is value,
                      f"{short(name)}: two entries of this name")
-    before = [key.removesuffix(FIRST) for key in flat if ("." + key).endswith("." + FIRST)]
+    before = [key.removesuffix(first) for key in flat if ("." + key).endswith("." + first)]
     if not before:
         return flat
     models = [prefix for prefix in before if "target" not in prefix]
@@ -460,10 +466,10 @@ def find_expert(path, task):
     return sizes, weights, sorted("bfloat16" if kind == "uint16" else kind for kind in kinds)
 
 
-def as_float32(key, value, shape):
+def as_float32(key, value, shape, elsewhere=ELSEWHERE):
     """A weight as the module keeps it; UserError if it is of another shape or kind."""
     need(is_weight(value) and value.shape == shape,
-         f"{key}: expected floats {shape}, found {described(value)}; {ELSEWHERE}")
+         f"{key}: expected floats {shape}, found {described(value)}; {elsewhere}")
     with np.errstate(over="ignore"):
         value = np.ascontiguousarray(widened(value), np.float32)
     need(np.isfinite(value).all(), f"{key}: holds values that are not finite in float32; choose "
@@ -516,11 +522,9 @@ def from_d4rl(found):
                                        if theirs in found}}
 
 
-def collect(path, environment, episodes, seed):
-    """(buffer, returns) of episodes that a file's model plays, each with noise of another
-    deviation; what the last decision of one led to isn't known."""
-    model, header = fac.load_model(path)
-    config = fac.PlannerConfig(**fac.made_for(header, path))
+def collect(model, config, environment, episodes, seed):
+    """(buffer, returns) of episodes that a model plays with a PlannerConfig, each with noise of
+    another deviation; what the last decision of one led to isn't known."""
     seeds = fac.training_seeds(seed, "collected episode", 0, episodes)
     obs, action, reward, _ = fac.play(model, None, config, seeds, 0, "collecting", environment,
                                       MAX_NOISE)
@@ -566,7 +570,9 @@ def run(args):
         if environment:
             with tempfile.TemporaryDirectory() as scratch:  # an expert is replaced with its replay
                 fac.write_npz(path := Path(scratch) / "expert.npz", header, weights)
-                buffer, returns = collect(path, environment, args.collect, args.seed)
+                model, made = fac.load_model(path)
+                planning = fac.PlannerConfig(**fac.made_for(made, path))
+                buffer, returns = collect(model, planning, environment, args.collect, args.seed)
         fac.write_npz(out / "expert.npz", header, weights)
         result = {**about, "file": args.file, "out": args.out, "stored_as": kinds, "episodes": 0,
                   "weights": sum(w.size for w in weights.values()), "model": vars(sizes),

@@ -3,9 +3,11 @@
 
     python data/multitask.py distill --tasks walker-walk hopper-hop
     python data/multitask.py evaluate --model runs/multitask-0/student.npz
+    python data/multitask.py distill --teacher mt30-5M.pt --collect 20
     python data/multitask.py figure10
 
-What the student is, and how it learns from several experts, is in multitask_model.py.
+What the student is, and how it learns from several experts, is in multitask_model.py; how one model
+of TD-MPC2's teaches in their place in tdmpc2.py.
 """
 import argparse
 import contextlib
@@ -19,8 +21,10 @@ import numpy as np
 sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
 import experiments  # noqa: E402
 import fac_tdmpc_ref as fac  # noqa: E402
+import import_expert  # noqa: E402
 import latents  # noqa: E402
 from multitask_model import MultitaskDistiller, load, save  # noqa: E402
+from tdmpc2 import Checkpoint  # noqa: E402
 
 # ----------------------------------------------------------------------------------- distill
 
@@ -49,10 +53,49 @@ def load_path(task, data, name):
     return Path(data) / task / name if data else fac.data_file(task, name)
 
 
-def load_expert(task, data):
-    """(expert, header, path) of a task."""
+def read_teacher(args):
+    """The Checkpoint that --teacher names, or None."""
+    fac.need(args.teacher or not (args.teacher_tasks or getattr(args, "collect", None)),
+             "--teacher-tasks and --collect are for --teacher FILE; experts in data/ have replays")
+    return Checkpoint(args.teacher, args.teacher_tasks) if args.teacher else None
+
+
+def load_expert(task, data, checkpoint=None):
+    """(expert, header, path) of a task, out of a Checkpoint if there is one."""
+    if checkpoint:
+        return checkpoint.teacher(task), {"task": task}, checkpoint.path
     path = load_path(task, data, "expert.npz")
     return *fac.load_model(path, ["expert"]), path
+
+
+def load_data(task, args, checkpoint, seed, folder):
+    """(expert, its PlannerConfig, replay) of a task. A Checkpoint's policy plays --collect episodes
+    as replay, which are kept in `folder`."""
+    if not checkpoint:
+        expert, header, replay, path = fac.load_data(argparse.Namespace(
+            task=task, expert=args.data and Path(args.data) / task, replay=None))
+        return expert, fac.PlannerConfig(**fac.made_for(header, path)), replay
+    expert, path = checkpoint.teacher(task), Path(args.data or fac.DATA) / task / "replay.npz"
+    if args.collect:
+        path = collect(expert, task, args.collect, seed, folder)
+    fac.need(path.exists(), f"{path}: no such file; --collect 20 has the teacher play instead")
+    replay = fac.Replay(path)
+    found = fac.made_for(replay.header, path).get("action_repeat", fac.ACTION_REPEAT)
+    fac.need(found == fac.ACTION_REPEAT, f"{path}: header: action_repeat: expected "
+             f"{fac.ACTION_REPEAT}, as TD-MPC2's, found {found}; pass --collect 20")
+    return expert, fac.PlannerConfig(), replay
+
+
+def collect(expert, task, episodes, seed, folder):
+    """Path of the replay of episodes that an expert's policy plays, or has played."""
+    about = {"expert": fac.checksum(expert.params.values()), "seed": seed, "episodes": episodes,
+             "task": task, "versions": fac.software()}
+    path = folder / f"{task}-replay-{experiments.crc(about):08x}.npz"
+    if not path.exists():
+        planning = fac.PlannerConfig(prior="policy", iterations=0)
+        import_expert.collect(expert, planning, fac.make_robot(task), episodes, seed)[0].write(
+            path, about)
+    return path
 
 
 def let_play(teacher, task, planning, workers, folder):
@@ -68,16 +111,15 @@ def let_play(teacher, task, planning, workers, folder):
     teacher.add(*fac.read_npz(path, ("played",))[1].values())
 
 
-def distil(args, config, out, seed, centralized):
+def distil(args, config, out, seed, centralized, checkpoint=None):
     """Distil a student of args.tasks into the folder `out`, or go on there; result. It's saved
-    after each of `marked` steps, too, as step-N.npz."""
+    after each of `marked` steps, too, as step-N.npz. checkpoint: teaches in the experts' place."""
     teachers, plannings, out = {}, {}, Path(out)
+    played = out.parent / "played"
     start = load(args.start)[0] if args.start else None
     with contextlib.ExitStack() as stack:
         for task in args.tasks:
-            expert, header, replay, path = fac.load_data(argparse.Namespace(
-                task=task, expert=args.data and Path(args.data) / task, replay=None))
-            plannings[task] = fac.PlannerConfig(**fac.made_for(header, path))
+            expert, plannings[task], replay = load_data(task, args, checkpoint, seed, played)
             teachers[task] = stack.enter_context(contextlib.closing(fac.Distiller(
                 expert, replay, config, 1 if centralized else None, seed)))
         settings = {"seed": seed, "centralized": centralized, "distill": vars(config), "of": {
@@ -92,7 +134,7 @@ def distil(args, config, out, seed, centralized):
             fac.same_settings({key: before.get(key) for key in settings}, settings, path)
         for task, teacher in teachers.items():
             if config.expert_episodes:
-                let_play(teacher, task, plannings[task], args.workers, out.parent / "played")
+                let_play(teacher, task, plannings[task], args.workers, played)
         agents, count = distiller.student.config.num_agents, len(distiller.optimizer.vector)
         print(f"{len(teachers)} tasks, {agents} agents, {count:,} weights; {config.steps:,} steps "
               f"of {config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
@@ -121,10 +163,11 @@ def read_config(args):
 
 def command_distill(args):
     """distill: one student of many tasks."""
-    args.tasks = named(args.tasks) or small_tasks()
+    checkpoint = read_teacher(args)
+    args.tasks = named(args.tasks) or (checkpoint.known if checkpoint else small_tasks())
     name = "multitask-centralized" if args.centralized else "multitask"
     result = distil(args, read_config(args), args.out or f"runs/{name}-{args.seed}", args.seed,
-                    args.centralized)
+                    args.centralized, checkpoint)
     ranks = result["rank_correlation_returns"]
     fac.print_table([("rank correlation of G", *(f"H = {h}" for h in range(
         len(ranks[args.tasks[0]])))), *((task, *(f"{x:.2f}" for x in own))
@@ -148,12 +191,14 @@ def command_evaluate(args):
     student, header = load(args.model)
     config = fac.from_dict(fac.DistillConfig, header.get("distill"), f"{args.model}: distill")
     around, found = getattr(args, "PlannerConfig.prior") != "none", {}
+    checkpoint = read_teacher(args)
     for task in named(args.tasks) or student.dims:
         fac.need(task in student.dims, f"--tasks: {task}: {args.model} is of "
                  f"{', '.join(student.dims)}")
-        expert, own, path = load_expert(task, args.data)
+        expert, own, path = load_expert(task, args.data, checkpoint)
         fac.need(fac.checksum(expert.params.values()) in header["of"][task], f"{path}: another "
-                 f"expert than {args.model} was distilled from; name its folder with --data")
+                 f"expert than {args.model} was distilled from; name its folder with --data, or "
+                 "its file with --teacher")
         planning = fac.from_args(fac.PlannerConfig, args, **{
             **fac.made_for(own, path), "horizon": config.horizon,
             **(fac.STUDENT_PLANNING if around else {})})
@@ -314,6 +359,12 @@ def make_parser():
         sub.add_argument("--data", help="folder with TASK/expert.npz and replay.npz [data]")
         return sub.add_argument
 
+    def add_teacher(option):
+        option("--teacher", metavar="FILE", help="a TD-MPC2 checkpoint of many tasks, which "
+               "teaches them instead of experts")
+        option("--teacher-tasks", nargs="+", default=[], metavar="TASK", help="its tasks in its "
+               "order, - for those of others [mt30's or mt80's]")
+
     small = f"experts in data/ of at most {MOST_ACTIONS} action dimensions"
     option = add("distill", command_distill, "Distil many tasks' experts into one student.", small,
                  epilog="Given again, a cut-off run goes on. What the policies play is kept "
@@ -325,11 +376,15 @@ def make_parser():
            "here, to see what these learn from those")
     option("--out", help="folder for the results [runs/multitask-SEED, "
            "runs/multitask-centralized-SEED]")
+    add_teacher(option)
+    option("--collect", type=functools.partial(fac.natural, least=2), metavar="N", help="episodes "
+           "of each task that --teacher's policy plays as replay [those in --data]")
     option = add("evaluate", command_evaluate, "Plan with a student in each of its tasks, by "
                  "default around its teacher's policy; with --prior none it plans alone.",
                  "the student's", True)
     option("--seed", type=fac.natural, default=0, help="of the episodes [0]")
     option("--episodes", type=positive, default=20, help="of each task [20]")
+    add_teacher(option)
     fac.add_config(commands.choices["evaluate"], fac.PlannerConfig,
                    skip=("action_repeat", "horizon"), **fac.STUDENT_PLANNING)
     option = add("latents", command_latents, "Figure 10, middle and right: t-SNE of the walkers' "

@@ -511,6 +511,7 @@ HOSTILE = {
     "half an item": (b"}(" + text("a") + b"u", "sets other items"),
     "a tuple as key": (b"})Ns", "sets other items"),
     "a call of a storage": (named("torch.FloatStorage") + b")R", "calls something"),
+    "a call of a dtype": (named("torch.float32") + b")R", "calls something"),
     "a call of a dict": (b"})R", "calls something"),
     "a call with a dict": (named("collections.OrderedDict") + b"}R", "calls something"),
     "OrderedDict of items": (named("collections.OrderedDict") + b")\x85R", "calls something"),
@@ -1047,11 +1048,10 @@ def test_collected_episodes_differ_in_start_and_noise_and_end_with_the_robot(mon
             self.made[-1].append(action)
             return np.full(8, len(self.made[-1])), 1.0, len(self.made[-1]) == 6 + len(self.made) % 2
 
-    fac.save_model(tmp_path / "x.npz", random_model(1), {"kind": "expert", "task": TASK})
     monkeypatch.setattr(fac, "play", lambda *args, play=fac.play: (
         seen.append(args[-1]), play(*args))[1])
     seen = []
-    buffer, returns = import_expert.collect(tmp_path / "x.npz", Robot(), 40, 5)
+    buffer, returns = import_expert.collect(random_model(1), fac.PlannerConfig(), Robot(), 40, 5)
     assert len({seed for seed, *_ in Robot.made}) == len(Robot.made) == len(buffer) == 40
     assert returns == [6, 5] * 20 and buffer.lengths.tolist() == [5, 4] * 20
     assert seen == [import_expert.MAX_NOISE]
