@@ -9,8 +9,8 @@ action dimension. Each joint then plans alone: cheaper, and in parallel.
 
 Part I is the method, with [D1] to [D7], to be read from top to bottom: 1 settings, 2 layers,
 3 world model, 4 distillation (Equation 4, Algorithm 1), 5 planning (Equations 2 and 3). It runs
-(`distill --plain`). Part II is what is added to it, the same in less time, and engineering. Experts
-learn, by Equation 1, in data/. Departures from the paper, [D1] to [D9], are in the README.
+(`distill --plain`). Part II adds [D8] and [D9], has it faster, and the engineering. Experts learn,
+by Equation 1, in data/. The README lists the departures from the paper, [D1] to [D9].
 
 The one idea that keeps it small: every model carries an agent axis N, and a centralized model is
 the case N = 1. There is one world model, one planner, one loss. The axes, everywhere:
@@ -46,7 +46,6 @@ from collections import defaultdict
 import numpy as np
 
 F32 = np.float32
-
 
 # ==== 1. Settings =====================================================================
 
@@ -173,6 +172,7 @@ ENCODER = ("linear", "elu", "linear")
 MLP = ("linear", "elu", "linear", "elu", "linear")
 QNET = ("linear", "norm", "tanh", "linear", "elu", "linear")
 HEADS = (("_reward", MLP), ("_Q1", QNET), ("_Q2", QNET))
+NETWORKS = {"_encoder": ENCODER, "_dynamics": MLP, "_pi": MLP, **dict(HEADS)}
 NORM_EPS = 1e-5  # PyTorch's LayerNorm
 POLICY_STD, POLICY_CUT = 0.05, 0.3  # of TD-MPC's policy noise: deviation, and where it is cut
 
@@ -242,8 +242,6 @@ def norm_backward(dy, x, g):
 
 def forward(kinds, params, name, x, tape=None):
     """Run a network on x (N, in, B). A tape (list) keeps x and every layer's output."""
-    if hasattr(params, "forward"):  # a client's frozen networks, of layers of their own
-        return params.forward(name, x, tape)
     if tape is not None:
         tape.append(x)
     for i, kind in enumerate(kinds):
@@ -261,8 +259,6 @@ def backward(kinds, params, name, tape, dy, grads):
     """Walk `forward` back: adds parameter gradients to `grads` (None: not wanted), returns dx.
 
     Uses the tape up: an activation's y, which only its own backward still reads, becomes its dx."""
-    if hasattr(params, "backward"):
-        return params.backward(name, tape, dy)
     for i in reversed(range(len(kinds))):
         kind, x, y = kinds[i], tape[i], tape[i + 1]
         if kind == "linear" and grads is None:
@@ -347,19 +343,25 @@ class WorldModel:
             params[f"{name}.{i}.bias"] = np.zeros((*shape[:2], 1), dtype)
         return cls(config, params)
 
+    def forward(self, name, x, tape=None):
+        """Run one of its NETWORKS on x (n, in, B); and back."""
+        return forward(NETWORKS[name], self.params, name, x, tape)
+
+    def backward(self, name, tape, dy, grads):
+        return backward(NETWORKS[name], self.params, name, tape, dy, grads)
+
     def encode(self, obs):
         """s = f_E(g).  obs (O, B) -> latents (N, m, B)."""
         return self.encode_features(self.expert.encode(obs) if self.expert else obs[None])
 
     def encode_features(self, x, tape=None):
         """The trained encoder on (1, F, B); its output is cut into the agents' latents."""
-        z = forward(ENCODER, self.params, "_encoder", x, tape)
+        z = self.forward("_encoder", x, tape)
         return z.reshape(self.config.num_agents, self.config.latent_dim, -1)
 
     def encode_backward(self, dz, tape, grads):
         """Walk `encode_features` back from dz (N, m, B): adds to `grads`, returns dx (1, F, B)."""
-        dy = dz.reshape(1, -1, dz.shape[-1])
-        return backward(ENCODER, self.params, "_encoder", tape, dy, grads)
+        return self.backward("_encoder", tape, dz.reshape(1, -1, dz.shape[-1]), grads)
 
     def features(self, obs, z):
         """What it reads (1, F, B): observations (O, B), or the expert's latents z of them [D3]."""
@@ -367,20 +369,20 @@ class WorldModel:
 
     def next(self, z, a):
         """s' = f_T(s, a).  z (N, m, B), a (N, d, B) -> (N, m, B)."""
-        return forward(MLP, self.params, "_dynamics", np.concatenate([z, a], 1))
+        return self.forward("_dynamics", np.concatenate([z, a], 1))
 
     def reward(self, z, a):
         """r^i = f_R^i(s^i, a^i) -> (N, B); the global reward is the sum over N."""
-        return forward(MLP, self.params, "_reward", np.concatenate([z, a], 1))[:, 0]
+        return self.forward("_reward", np.concatenate([z, a], 1))[:, 0]
 
     def q(self, z, a):
         """Both q^i = f_Q^i(s^i, a^i) (Table 2: num_q 2) -> two (N, B); the sums are global."""
         x = np.concatenate([z, a], 1)
-        return tuple(forward(QNET, self.params, name, x)[:, 0] for name in ("_Q1", "_Q2"))
+        return tuple(self.forward(name, x)[:, 0] for name in ("_Q1", "_Q2"))
 
     def policy(self, z):
         """The expert's policy mean, z (1, m, B) -> (1, A, B) in [-1, 1]."""
-        return np.tanh(forward(MLP, self.params, "_pi", z))
+        return np.tanh(self.forward("_pi", z))
 
     @property
     def has_policy(self):
@@ -425,22 +427,21 @@ def unroll(model, z, actions, tapes=None):
     tapes, for `unroll_backward`: "_dynamics h" for each h."""
     L, _, B, K = actions.shape
     n, m, d = model.config.num_agents, model.config.latent_dim, model.config.agent_actions
-    columns = B * K
-    x = np.empty((n, m + d, L * columns), z.dtype)
-    x[:, m:] = actions.reshape(L, n, d, columns).transpose(1, 2, 0, 3).reshape(n, d, -1)
-    x[:, :m, :columns] = np.repeat(z, K, axis=2)
+    x = np.empty((n, m + d, L * B * K), z.dtype)
+    x[:, m:] = actions.reshape(L, n, d, B * K).transpose(1, 2, 0, 3).reshape(n, d, -1)
+    x[:, :m, :B * K] = np.repeat(z, K, axis=2)
     for h in range(L - 1):
-        now, after = (slice(i * columns, (i + 1) * columns) for i in (h, h + 1))
-        x[:, :m, after] = forward(MLP, model.params, "_dynamics", x[:, :, now],
-                                  None if tapes is None else tapes[f"_dynamics {h}"])
+        now, after = (slice(i * B * K, (i + 1) * B * K) for i in (h, h + 1))
+        x[:, :m, after] = model.forward("_dynamics", x[:, :, now],
+                                        None if tapes is None else tapes[f"_dynamics {h}"])
     return x
 
 
 def run_heads(model, x, actions, tapes=None):
     """Every agent's share of reward and both Q at `unroll`'s x: three (N, L, B, K)."""
     L, _, B, K = actions.shape
-    return [forward(kinds, model.params, name, x, None if tapes is None else tapes[name])
-            .reshape(-1, L, B, K) for name, kinds in HEADS]
+    return [model.forward(name, x, None if tapes is None else tapes[name])
+            .reshape(-1, L, B, K) for name, _ in HEADS]
 
 
 def predict(model, z, actions, tapes=None):
@@ -453,9 +454,9 @@ def heads_backward(model, tapes, d_shares, grads):
     """Walk `run_heads` back: adds to `grads`, returns dx (N, m + d, L * B * K). d_shares: gradients
     by each share (N, L, B, K), or by sums of shares (fewer rows), the same for each summand."""
     n, dx = model.config.num_agents, 0
-    for (name, kinds), d in zip(HEADS, d_shares):
+    for (name, _), d in zip(HEADS, d_shares):
         d = np.repeat(d, n // len(d), 0).reshape(n, 1, -1)
-        dx = dx + backward(kinds, model.params, name, tapes[name], d, grads)
+        dx = dx + model.backward(name, tapes[name], d, grads)
     return dx
 
 
@@ -464,8 +465,8 @@ def unroll_backward(model, tapes, actions, dx, grads):
     (L, _, B, K), n, m = actions.shape, model.config.num_agents, model.config.latent_dim
     for h in reversed(range(L - 1)):
         now, after = (slice(i * B * K, (i + 1) * B * K) for i in (h, h + 1))
-        dx[:, :, now] += backward(MLP, model.params, "_dynamics", tapes[f"_dynamics {h}"],
-                                  np.ascontiguousarray(dx[:, :m, after]), grads)
+        dx[:, :, now] += model.backward("_dynamics", tapes[f"_dynamics {h}"],
+                                        np.ascontiguousarray(dx[:, :m, after]), grads)
     return dx[:, :m, :B * K].reshape(n, m, B, K).sum(3)
 
 
@@ -498,10 +499,9 @@ def distill_loss(student, features, actions, targets, config, grads=None, diverg
 
         mean over B of sum_h lambda^h [c_R D(R_h) + c_Q (D(Q1_h) + D(Q2_h))]
 
-    features (1, F, B): what the student's encoder reads in the first states; actions
-    (L, A, B, K): perturbed; targets: the expert's `predict` for them, three (L, B, K), or each
-    agent's part of these (`credit`), (N, L, B, K): D is summed over agents then. divergence: D, as
-    `soft_kl`. Returns loss and mean divergences of reward and value over steps and states."""
+    features (1, F, B): what the student's encoder reads in the first states; actions (L, A, B, K):
+    perturbed; targets: what the expert predicts for them, three (L, B, K), or each agent's part,
+    (N, L, B, K) [D9]. divergence: D. Returns loss, mean divergences of reward and of value."""
     tapes, encoder_tape = defaultdict(list), []
     z = student.encode_features(features, encoder_tape)
     x = unroll(student, z, actions, tapes)
@@ -938,10 +938,10 @@ def credit(expert, tapes, actions, predicted, sizes):
     expert: of one agent; tapes: of `unroll` and `run_heads` for its actions (L, A, B, K), used up;
     predicted: three (L, B, K); sizes: the agents' ModelConfig. Returns the reward's parts
     (N, L, B, K) and, for each Q, those of both Q's mean, by which plans are ranked."""
-    (L, A, B, K), m, params = actions.shape, expert.config.latent_dim, expert.params
+    (L, A, B, K), m = actions.shape, expert.config.latent_dim
     half = np.full((1, 1, L * B * K), 0.5, actions.dtype)
-    d_q = sum(backward(QNET, params, name, tapes[name], half, None) for name in ("_Q1", "_Q2"))
-    d_reward = backward(MLP, params, "_reward", tapes["_reward"], 2 * half, None)
+    d_q = sum(expert.backward(name, tapes[name], half, None) for name in ("_Q1", "_Q2"))
+    d_reward = expert.backward("_reward", tapes["_reward"], 2 * half, None)
     dx, later = np.stack([d_reward[0], d_q[0]], 1).reshape(m + A, 2, L, B * K), None
     way = actions - actions[..., :1]
     parts = np.zeros((A, 2, L, B, K), actions.dtype)
@@ -949,7 +949,7 @@ def credit(expert, tapes, actions, predicted, sizes):
         d = dx[:, :, j:j + 1]  # of the outputs at h = j by (s_j, a_j); those at h > j come by s_j+1
         if j < L - 1:
             tape = [np.tile(y, 2 * (L - 1 - j)) for y in tapes[f"_dynamics {j}"]]
-            later = backward(MLP, params, "_dynamics", tape, later.reshape(1, m, -1), None)
+            later = expert.backward("_dynamics", tape, later.reshape(1, m, -1), None)
             d = np.concatenate([d, later.reshape(m + A, 2, L - 1 - j, -1)], 2)
         later, g = d[:m], d[m:].reshape(A, 2, L - j, B, K)
         parts[:, :, j:] += way[j][:, None, None] * (g + g[..., :1]) / 2
@@ -1392,7 +1392,7 @@ class FastPlanner(AgentPlanner):
     def __init__(self, model, config):
         keep_memory()
         super().__init__(model, config)
-        plain = config.returns == "plain" or hasattr(model.params, "forward")
+        plain = config.returns == "plain" or type(model).forward is not WorldModel.forward
         self.fast = None if plain else Returns(model)
 
     def returns(self, z):

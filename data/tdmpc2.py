@@ -91,34 +91,36 @@ LAST = {"_encoder": SIMNORM, "_dynamics": SIMNORM, "_reward": TWO_HOT, "_Q1": TW
         "_Q2": TWO_HOT, "_pi": (lambda x: x, lambda dy, x: dy)}  # after a network's last layer
 
 
-class Networks(dict):
-    """A teacher's `params`, by TD-MPC2's names, which run as `fac.forward` and `fac.backward`."""
+class Teacher(fac.WorldModel):
+    """One task's expert, whose networks are TD-MPC2's, frozen; `params` by its names."""
 
     def layers(self, name):
         """(layer, whether LayerNorm follows, activation and its backward) of a network."""
-        for k in itertools.takewhile(lambda k: f"{name}.{k}.weight" in self, itertools.count()):
-            last = f"{name}.{k + 1}.weight" not in self
-            yield f"{name}.{k}", f"{name}.{k}.ln.weight" in self, LAST[name] if last else MISH
+        p = self.params
+        for k in itertools.takewhile(lambda k: f"{name}.{k}.weight" in p, itertools.count()):
+            last = f"{name}.{k + 1}.weight" not in p
+            yield f"{name}.{k}", f"{name}.{k}.ln.weight" in p, LAST[name] if last else MISH
 
     def forward(self, name, x, tape=None):
         """A tape keeps what each LayerNorm and each activation reads."""
+        p = self.params
         for layer, normed, (activation, _) in self.layers(name):
-            y = h = fac.linear(x, self[f"{layer}.weight"], self[f"{layer}.bias"])
+            y = h = fac.linear(x, p[f"{layer}.weight"], p[f"{layer}.bias"])
             if normed:
-                h = fac.norm(y, self[f"{layer}.ln.weight"], self[f"{layer}.ln.bias"])
+                h = fac.norm(y, p[f"{layer}.ln.weight"], p[f"{layer}.ln.bias"])
             if tape is not None:
                 tape += [y, h]
             x = activation(h)
         return x
 
-    def backward(self, name, tape, dy):
-        """dx of a network; uses the tape up."""
+    def backward(self, name, tape, dy, grads):
+        """dx of a network; uses the tape up. grads: None."""
         for layer, normed, (_, activation_backward) in reversed([*self.layers(name)]):
             h, y = tape.pop(), tape.pop()
             dy = activation_backward(dy, h)
             if normed:
-                dy, *_ = fac.norm_backward(dy, y, self[f"{layer}.ln.weight"])
-            dy = self[f"{layer}.weight"].swapaxes(1, 2) @ dy
+                dy, *_ = fac.norm_backward(dy, y, self.params[f"{layer}.ln.weight"])
+            dy = self.params[f"{layer}.weight"].swapaxes(1, 2) @ dy
         return dy
 
 
@@ -221,7 +223,7 @@ class Checkpoint:
         embedding = self.embedding[index]
         if (length := np.linalg.norm(embedding)) > 1:  # as TD-MPC2 does where it looks one up
             embedding = embedding / (length + 1e-7)
-        params = Networks(self.params)
+        params = dict(self.params)
         for name in LAST:
             before, own = (wide, dim_obs) if name == "_encoder" else [self.sizes.latent_dim] * 2
             W, bias = (params[f"{name}.0.{part}"] for part in PARTS[:2])
@@ -230,5 +232,5 @@ class Checkpoint:
             params[f"{name}.0.bias"] = bias + W[:, :, before:before + E] @ embedding[:, None]
         for part in PARTS[:2]:  # the policy's deviations aren't used
             params[f"_pi.2.{part}"] = params[f"_pi.2.{part}"][:, :dim_action]
-        return fac.WorldModel(dataclasses.replace(
+        return Teacher(dataclasses.replace(
             self.sizes, dim_obs=dim_obs, dim_action=dim_action), params)
