@@ -885,9 +885,10 @@ def planning_numbers(sizes, config):
 # ==== 7. Added to the paper: more states [D8], credit, a search around the policy [D9] =
 
 # how a student plans that was taught around its expert's policy, if its file says nothing else
-STUDENT_PLANNING = {"prior": "policy", "max_std": 0.15, "samples": 32, "iterations": 3,
+STUDENT_PLANNING = {"prior": "policy", "max_std": 0.15, "samples": 16, "iterations": 2,
                     "output": "mean"}
-WELL_RANKED, WIDE = 0.75, 1.0  # see `search_width`
+WELL_RANKED = 0.75  # see `student_search`
+WIDE_SEARCH = {"max_std": 1.0, "samples": 32, "iterations": 3}
 
 
 def student_planning(config):
@@ -896,10 +897,11 @@ def student_planning(config):
     return STUDENT_PLANNING if config.policy_share else {}
 
 
-def search_width(rank):
-    """A student's first deviation, by its held-out rank correlation of G over H [D9]: who ranks
-    plans well finds better ones far from the policy; others only what their errors promise."""
-    return WIDE if rank >= WELL_RANKED else STUDENT_PLANNING["max_std"]
+def student_search(rank):
+    """What a student plans with instead, by its held-out rank correlation of G over H [D9]: who
+    ranks plans well finds better ones far from the policy, with more samples; others only what
+    their errors promise."""
+    return WIDE_SEARCH if rank >= WELL_RANKED else {}
 
 
 def agent_order(sizes):
@@ -2340,7 +2342,7 @@ def load_data(args):
 
 def distil_and_save(distiller, args, planning, header, out):
     """Algorithm 1 to its end; writes student, curve and configuration. Returns result's part, and
-    the student's planning, around the policy with `search_width`'s deviation if none is given."""
+    the student's planning, around the policy by `student_search` where no flag says otherwise."""
     student, config, replay = distiller.student, distiller.config, distiller.replay
     sizes = student.config
     settings = {"task": args.task, "seed": args.seed,
@@ -2358,9 +2360,9 @@ def distil_and_save(distiller, args, planning, header, out):
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
     curve, seconds, before = train_student(distiller, out, settings, planning, args.workers)
     ranks = rank_results(distiller, 256, planning.discount)
-    if planning.prior == "policy" and getattr(args, "PlannerConfig.max_std") is None:
-        width = search_width(ranks["rank_correlation_returns"][-1])
-        planning = dataclasses.replace(planning, max_std=width)
+    if planning.prior == "policy":
+        search = student_search(ranks["rank_correlation_returns"][-1])
+        planning = from_args(PlannerConfig, args, **{**asdict(planning), **search})
     save_model(out / "student.npz", student, {
         "kind": "student", **settings, "training": header.get("training", {}),
         "planner": {name: getattr(planning, name) for name in STUDENT_PLANNING}})
@@ -2368,7 +2370,7 @@ def distil_and_save(distiller, args, planning, header, out):
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
             "steps": config.steps, "seconds": round(seconds, 1), "seconds_total": before,
             "kl_reward": curve[-1][3], "kl_value": curve[-1][4],
-            **ranks, "max_std": planning.max_std, "out": str(out),
+            **ranks, **{name: getattr(planning, name) for name in WIDE_SEARCH}, "out": str(out),
             "picture": drawn(draw_curve, out / "curve.png", curve,
                              f"{args.task}, seed {args.seed}")}, planning
 
@@ -2545,7 +2547,9 @@ def make_parser():
                       "factored student (Algorithm 1), then evaluate and time both with MPPI.",
                       epilog="Given again, a cut-off run goes on; a finished one is evaluated. "
                       f"A student whose rank correlation of G is {WELL_RANKED} or more in held-out "
-                      f"states searches with --plan-max-std {WIDE}, unless told otherwise.")
+                      "states searches with " + ", ".join(
+                          f"--plan-{name.replace('_', '-')} {value}"
+                          for name, value in WIDE_SEARCH.items()) + ", unless told otherwise.")
     add = sub.add_argument
     add("--task", default="reacher-hard", help="one of: " + task_names())
     add("--seed", type=natural, default=0, help="of distillation [0]")

@@ -368,10 +368,9 @@ def command_departures(args):
 
 def command_students(args):
     """students: what `distill` makes by default, for the README's main table."""
-    config, planning = (of(**fac.preset_values(of, args.preset)) for of in (
-        fac.DistillConfig, fac.PlannerConfig))
-    defaults = {"steps": config.steps, **vars(planning), **fac.student_planning(config)}
-    about = {k: getattr(args, k) or defaults[k] for k in ("steps", "samples", "iterations")}
+    config = fac.DistillConfig(**fac.preset_values(fac.DistillConfig, args.preset))
+    about = {"steps": args.steps or config.steps, **{
+        k: v for k in ("samples", "iterations") if (v := getattr(args, k))}}
     data = {task: data_checksums(task) for task in args.tasks}
     return run_all(args, functools.partial(students.distil_student, students=args.students), [
         make_run(task, seed, args.preset, data=data[task], episodes=args.episodes,

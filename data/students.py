@@ -10,8 +10,8 @@ import fac_tdmpc_ref as fac  # noqa: E402
 from tables import deviation, markdown, of_returns  # noqa: E402
 
 EVALUATION_SEEDS = (0, 1)
-MEASURED = ("rank_correlation", "plan_ms")  # what a row keeps
-HEADS = ("seeds", "student", "kept, evaluation seeds 0 / 1", "least kept",
+MEASURED = ("rank_correlation", "plan_ms", "samples", "iterations")  # what a row keeps
+HEADS = ("seeds", "MPPI", "student", "kept, evaluation seeds 0 / 1", "least kept",
          "speed-up, one core", "rank correlation of G, H = 0 / last", "minutes")
 FLAGS = {"samples": "plan-samples", "iterations": "plan-iterations", "num_agents": "num-agents"}
 
@@ -65,7 +65,9 @@ def cells(rows):
     first, students = rows[0], sum(rows.values(), [])
     faster = measured(first, lambda x: x["plan_ms_expert"] / x["plan_ms_student_in_process"])
     ranks = (measured(first, lambda x, h=h: x["rank_correlation_returns"][h]) for h in (0, -1))
-    return [len(first), mean_and_spread([float(row["return_mean"]) for row in first], deviation),
+    budget = "{samples} x {iterations}".format_map(json.loads(first[0]["ranks"]))
+    returns = [float(row["return_mean"]) for row in first]
+    return [len(first), budget, mean_and_spread(returns, deviation),
             " / ".join(f"{kept(rows[seed]):.2f}" for seed in EVALUATION_SEEDS),
             f"{min(kept([row]) for row in students):.2f}", f"{faster:.1f}",
             " / ".join(f"{x:.2f}" for x in ranks),
@@ -73,26 +75,27 @@ def cells(rows):
 
 
 def table(rows, authors):
-    """The README's main table, {"TASK, SAMPLES x ITERATIONS": {preset: cells}} and Markdown: a line
-    for each task and planner's budget, columns for each preset. authors: {task: text}."""
+    """The README's main table, {task, and what flags chose of its planning: {preset: cells}}, and
+    Markdown: a line for each, columns for each preset. authors: {task: text}."""
     runs, presets = {}, list(dict.fromkeys(row["case"] for row in rows))
     for row in rows:
-        budget = "{samples} x {iterations}".format_map(json.loads(row["settings"]))
-        runs.setdefault((row["task"], budget), {}).setdefault(
+        about = json.loads(row["settings"])
+        chosen = [f"{name} {about[name]}" for name in ("samples", "iterations") if name in about]
+        runs.setdefault((row["task"], *chosen), {}).setdefault(
             row["case"], {seed: [] for seed in EVALUATION_SEEDS})[
             int(row["evaluation_seed"])].append(row)
     lines, result = [], {}
-    for (task, budget), found in runs.items():
+    for (task, *chosen), found in runs.items():
         row = next(iter(found.values()))[0][0]
         policy = json.loads(row["policy_returns"])
         own = {preset: cells(found[preset]) for preset in found}
-        result[f"{task}, {budget}"] = own
-        lines.append([task, json.loads(row["settings"])["num_agents"], budget,
+        result[", ".join([task, *chosen])] = own
+        lines.append([", ".join([task, *chosen]), json.loads(row["settings"])["num_agents"],
                       mean_and_spread(json.loads(row["expert_returns"]), np.std),
                       mean_and_spread(policy, np.std) if policy else "-",
                       *sum((own.get(preset, ["-"] * len(HEADS)) for preset in presets), []),
                       authors.get(task, "-")])
     return result, markdown([
-        "task", "N", "MPPI", "expert", "its policy alone",
+        "task", "N", "expert", "its policy alone",
         *(f"{head}, {preset}" if len(presets) > 1 else head for preset in presets
           for head in HEADS), "authors' logs: 100% TD-MPC / Fac-TDMPC"], lines)

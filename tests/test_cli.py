@@ -407,13 +407,15 @@ def test_distill_prints_json_and_a_table(distilled):
     assert len(result["policy_returns"]) == 1 and f"{policy:.0f} ± 0" in table
     header, _ = fac.read_npz(folder / "student.npz", ("student",))
     assert header["planner"] == {**fac.STUDENT_PLANNING, "samples": 16, "iterations": 1}
-    assert result["max_std"] == fac.STUDENT_PLANNING["max_std"]
+    assert (result["max_std"], result["samples"]) == (fac.STUDENT_PLANNING["max_std"], 16)
 
 
 @pytest.mark.parametrize("flags, rank, expected", [
-    ([], fac.WELL_RANKED, fac.WIDE), (["--plan-max-std", "0.3"], fac.WELL_RANKED, 0.3),
-    (["--preset", "plain"], fac.WELL_RANKED, 2.0), (["--plan-prior", "none"], 0.0, 2.0),
-    ([], fac.WELL_RANKED - 0.01, fac.STUDENT_PLANNING["max_std"])])
+    ([], fac.WELL_RANKED, (1.0, 32, 3)), ([], fac.WELL_RANKED - 0.01, (0.15, 16, 2)),
+    (["--plan-max-std", "0.3"], fac.WELL_RANKED, (0.3, 32, 3)),
+    (["--plan-samples", "8"], fac.WELL_RANKED, (1.0, 8, 3)),
+    (["--preset", "plain"], fac.WELL_RANKED, (2.0, 128, 4)),
+    (["--plan-prior", "none"], fac.WELL_RANKED, (2.0, 128, 4))])
 def test_who_ranks_plans_well_searches_widely(
         tmp_path, files, monkeypatch, capsys, flags, rank, expected):
     found = {"rank_correlation_by_step": [1.0], "rank_correlation_returns": [0.0, rank],
@@ -421,15 +423,17 @@ def test_who_ranks_plans_well_searches_widely(
              "rank_correlation_episodes": 1}
     monkeypatch.setattr(fac, "rank_results", lambda *_: found)
     monkeypatch.setattr(fac, "evaluate_both", lambda expert, student, *_: (
-        planned.append(student[1].max_std), {})[1])
+        planned.append(vars(student[1])), {})[1])
     monkeypatch.setattr(fac, "time_both", lambda *_: {})
     monkeypatch.setattr(fac, "report", lambda *_: None)
     planned = []
     arguments = distill_arguments(files, "--workers", "0", "--json", "--out", tmp_path / "out")
-    assert fac.main([*map(str, arguments), *flags]) == 0
+    own = arguments.index("--plan-samples")
+    assert fac.main([*map(str, arguments[:own] + arguments[own + 4:]), *flags]) == 0
     header, _ = fac.read_npz(tmp_path / "out" / "student.npz", ("student",))
-    assert json.loads(capsys.readouterr().out)["max_std"] == expected
-    assert planned == [expected] and header["planner"]["max_std"] == expected
+    for found in (json.loads(capsys.readouterr().out), header["planner"], *planned):
+        assert tuple(found[name] for name in ("max_std", "samples", "iterations")) == expected
+    assert len(planned) == 1
 
 
 def test_part_one_alone_distils_and_goes_on_from_its_end(tmp_path, files):

@@ -1002,22 +1002,23 @@ def test_report_draws_what_the_csvs_hold(tmp_path):
 # students -----------------------------------------------------------------------------
 
 def write_student_rows(path, policy=(90.0, 110.0)):
-    """Two seeds of a default student, one of the paper's, and a second budget."""
-    def rows(first, second):
+    """Two seeds of a default student, one of the paper's, and a budget chosen by flags."""
+    def rows(first, second, samples=32, iterations=3):
         return [{"step": 9, "return_mean": np.mean(returns), "returns": returns,
                  "expert_returns": [200.0, 50.0], "policy_returns": policy, "minutes": 6.0,
                  "evaluation_seed": evaluation_seed, "ranks": {
                      "rank_correlation_returns": [0.9, 0.5], "plan_ms_expert": 9.0,
-                     "plan_ms_student_in_process": 2.0}}
+                     "plan_ms_student_in_process": 2.0, "samples": samples,
+                     "iterations": iterations}}
                 for evaluation_seed, returns in ((1, second), (0, first))]
 
-    small, full = ({"samples": s, "iterations": i, "steps": 9, "num_agents": 6}
-                   for s, i in ((128, 4), (512, 6)))
-    write_rows(path, [("walker-run", 0, "default", small, rows([180.0, 20.0], [250.0, 0.0])),
-                      ("walker-run", 1, "default", small, rows([140.0, 10.0], [200.0, 0.0])),
-                      ("walker-run", 0, "paper", small, rows([90.0, 10.0], [80.0, 0.0])),
-                      ("walker-run", 0, "default", full, rows([100.0, 0.0], [100.0, 0.0])),
-                      ("walker-run", 1, "default", full, rows([100.0, 0.0], [100.0, 0.0]))])
+    own = {"steps": 9, "num_agents": 6}
+    full = {**own, "samples": 512, "iterations": 6}
+    write_rows(path, [("walker-run", 0, "default", own, rows([180.0, 20.0], [250.0, 0.0])),
+                      ("walker-run", 1, "default", own, rows([140.0, 10.0], [200.0, 0.0])),
+                      ("walker-run", 0, "paper", own, rows([90.0, 10.0], [80.0, 0.0], 512, 6)),
+                      ("walker-run", 0, "default", full, rows([100.0], [100.0], 512, 6)),
+                      ("walker-run", 1, "default", full, rows([100.0], [100.0], 512, 6))])
 
 
 def test_the_table_of_students_has_a_line_for_each_budget_and_columns_for_each_preset(tmp_path):
@@ -1026,7 +1027,8 @@ def test_the_table_of_students_has_a_line_for_each_budget_and_columns_for_each_p
     heads, _, first, second = (
         [part.strip() for part in line.split("|")[1:-1]] for line in text.splitlines())
     row = dict(zip(heads, first))
-    assert row.pop("task") == "walker-run" and row.pop("MPPI") == "128 x 4" and row["N"] == "6"
+    assert row.pop("task") == "walker-run" and row["N"] == "6"
+    assert (row["MPPI, default"], row["MPPI, paper"]) == ("32 x 3", "512 x 6")
     assert row["expert"] == "125 ± 75" and row["its policy alone"] == "100 ± 10"  # over episodes
     assert row["student, default"] == "88 ± 18"  # 100 and 75: over seeds, n - 1
     assert row["speed-up, one core, default"] == "4.5"
@@ -1037,11 +1039,12 @@ def test_the_table_of_students_has_a_line_for_each_budget_and_columns_for_each_p
     assert (row["seeds, default"], row["seeds, paper"], row["minutes, default"]) == ("2", "1", "6")
     assert row["authors' logs: 100% TD-MPC / Fac-TDMPC"] == "836 / 809"
     other = dict(zip(heads, second))
-    assert other["MPPI"] == "512 x 6" and other["least kept, paper"] == "-"
-    assert list(result) == ["walker-run, 128 x 4", "walker-run, 512 x 6"]
+    assert other["MPPI, default"] == "512 x 6" and other["least kept, paper"] == "-"
+    assert list(result) == ["walker-run", other["task"]]
+    assert other["task"] == "walker-run, samples 512, iterations 6"
     write_student_rows(tmp_path / "none.csv", policy=())  # an expert without a policy
     _, text = experiments.report_students("students", tmp_path / "none.csv", tmp_path)
-    assert "| 125 ± 75 | - | 2 | 88 ± 18 |" in text
+    assert "| 125 ± 75 | - | 2 | 32 x 3 | 88 ± 18 |" in text
 
 
 def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkeypatch):
@@ -1094,9 +1097,9 @@ def test_a_preset_s_students_have_its_budget_and_a_folder_of_their_own(monkeypat
     for flags in ([], ["--preset", "paper"], ["--preset", "paper", "--steps", "14000", "--samples",
                                               "128", "--iterations", "4"]):
         assert experiments.main(["students", "--tasks", "walker-run", "--seeds", "0", *flags]) == 0
-    found = [(run["case"], *(json.loads(run["settings"])[k] for k in (
+    found = [(run["case"], *(json.loads(run["settings"]).get(k) for k in (
         "steps", "samples", "iterations"))) for run in seen]
-    assert found == [("default", 14000, 32, 3), ("paper", 100000, 512, 6),
+    assert found == [("default", 14000, None, None), ("paper", 100000, None, None),
                      ("paper", 14000, 128, 4)]
     assert [str(students.folder("runs", "walker-run", 0, preset)) for preset in (
         "default", "paper")] == ["runs/walker-run-0", "runs/walker-run-0-paper"]
