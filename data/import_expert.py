@@ -99,8 +99,9 @@ def unpack(archive, member):
     return data
 
 
-NPY = re.compile(rb"\x93NUMPY\x01\x00(..)\{'descr': '([<>|](?:f[248]|[bui]1))', 'fortran_order': "
-                 rb"(True|False), 'shape': \((\d{1,9}(?:, \d{1,9})*),?\), \} *\n", re.DOTALL)
+NPY = re.compile(rb"\x93NUMPY\x01\x00(..)\{'descr': '([<>|](?:f[248]|b1|[iu][148]))', "
+                 rb"'fortran_order': (True|False), 'shape': \((\d{1,9}(?:, \d{1,9})*),?\), \} *\n",
+                 re.DOTALL)
 
 
 Unread = namedtuple("Unread", "reason")  # an entry that matters only if it is asked for
@@ -114,7 +115,7 @@ def read_npz(path):
         if name == "header":  # in this project's own files
             continue
         if not match or match.end() != 10 + int.from_bytes(match[1], "little"):
-            found[name] = Unread("no array of floats or bools as numpy.savez writes it")
+            found[name] = Unread("no array of numbers as numpy.savez writes it")
             continue
         shape, dtype = [int(n) for n in match[4].split(b", ")], np.dtype(match[2].decode())
         if (0 < math.prod(shape) * dtype.itemsize == len(data) - match.end() and
@@ -307,7 +308,7 @@ def read_safetensors(path):
 # ------------------------------------------------------------------------------------ HDF5
 
 OWN = {"observation": "observations", "action": "actions", "continues": None}  # and D4RL's name
-D4RL_ENDS = "terminals", "timeouts"
+D4RL_ENDS = "terminals", "timeouts", "terminations", "truncations"  # the last two: Gymnasium's
 
 
 def read_hdf5(path):
@@ -421,7 +422,7 @@ def is_weight(value):
 
 def described(value):
     """What a message says of what a file holds under a name."""
-    return (f"{value.dtype} {value.shape}" if type(value) is np.ndarray else
+    return (f"{value.dtype.name} {value.shape}" if type(value) is np.ndarray else
             value.reason if type(value) is Unread else
             "nothing" if value is None else type(value).__name__)
 
@@ -487,6 +488,8 @@ def find_replay(path, sizes):
         for key in OWN:
             need(key in found, f"{key}: not there, only {', '.join(map(short, [*found][:9]))}")
         rows = getattr(found["continues"], "size", 0)
+        need(rows, "continues: expected bools, a row or more, found "
+             f"{described(found['continues'])}")
         for key, kind, shape in (("continues", "bool", (rows,)),
                                  ("observation", "float", (rows, sizes.dim_obs)),
                                  ("action", "float", (rows, sizes.dim_action))):
@@ -507,7 +510,11 @@ def find_replay(path, sizes):
 def from_d4rl(found):
     """D4RL's arrays by this project's names: an episode's last row is one of `terminals` or
     `timeouts`, or the file's, whose action goes unused, for what follows it isn't there."""
-    ends = [np.ravel(found[key]) != 0 for key in D4RL_ENDS if type(found.get(key)) is np.ndarray]
+    there = [key for key in D4RL_ENDS if key in found]
+    for key in there:  # an end that isn't read would join two episodes
+        need(type(found[key]) is np.ndarray and found[key].size, f"{key}: expected numbers or "
+             f"bools, found {described(found[key])}")
+    ends = [np.ravel(found[key]) != 0 for key in there]
     need(ends and len({len(end) for end in ends}) == 1, f"expected {' or '.join(D4RL_ENDS)}, "
          f"equally long, found {', '.join(map(short, [*found][:9]))}")
     continues = ~np.logical_or.reduce(ends)
