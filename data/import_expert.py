@@ -135,10 +135,11 @@ Storage = namedtuple("Storage", "data dtype")  # a tensor's memory: a member's b
 
 # NumPy has no bfloat16: unsigned integers, which are read for nothing else, stand for it
 STORAGES = {"torch DoubleStorage": "f8", "torch FloatStorage": "f4", "torch HalfStorage": "f2",
-            "torch BFloat16Storage": "u2", "torch LongStorage": "i8"}
+            "torch BFloat16Storage": "u2", "torch LongStorage": "i8", "torch IntStorage": "i4",
+            "torch ByteStorage": "u1", "torch BoolStorage": "b1"}
 OPCODES = set("""PROTO NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 BINFLOAT BINUNICODE EMPTY_DICT
 MARK EMPTY_LIST APPEND APPENDS EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 BINPUT LONG_BINPUT BINGET
-LONG_BINGET SETITEM SETITEMS BUILD GLOBAL REDUCE BINPERSID""".split())
+LONG1 LONG_BINGET SETITEM SETITEMS BUILD GLOBAL REDUCE BINPERSID""".split())
 CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
 
 
@@ -176,7 +177,7 @@ def read_pickle(data, members, byteorder):
                 need(argument == 2, "has another protocol than 2")
             case "NONE" | "NEWTRUE" | "NEWFALSE" | "EMPTY_TUPLE":
                 stack.append(CONSTANTS[name])
-            case "BININT" | "BININT1" | "BININT2" | "BINFLOAT" | "BINUNICODE":
+            case "BININT" | "BININT1" | "BININT2" | "LONG1" | "BINFLOAT" | "BINUNICODE":
                 stack.append(argument)
             case "EMPTY_DICT":
                 stack.append({})
@@ -299,10 +300,9 @@ def read_safetensors(path):
     except Exception as error:  # the library's own, mostly
         raise fac.UserError(f"not a readable safetensors file ({short(error)})") from None
     kinds = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "BF16": "<u2"}
-    for name, t in found:
-        need(t["dtype"] in kinds and len(t["shape"]) <= MAX_RANK and t["data"], f"{short(name)}: "
-             f"expected {', '.join(kinds)}, found {t['dtype']} {t['shape'][:MAX_RANK]}")
-    return {name: np.ndarray(t["shape"], kinds[t["dtype"]], t["data"]) for name, t in found}
+    return {name: np.ndarray(t["shape"], kinds[t["dtype"]], t["data"])
+            if t["dtype"] in kinds and len(t["shape"]) <= MAX_RANK and t["data"] else
+            Unread(f"{t['dtype']} {t['shape'][:MAX_RANK]}") for name, t in found}
 
 
 # ------------------------------------------------------------------------------------ HDF5

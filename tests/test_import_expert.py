@@ -318,13 +318,20 @@ def test_safetensors_by_hand_and_without_the_library(tmp_path, monkeypatch):
     _, found, kinds = import_expert.find_expert(tmp_path / "model.safetensors", TASK)
     assert kinds == ["float32"]
     assert all(np.array_equal(found[k], v) for k, v in weights().items())
+    write_safetensors(tmp_path / "model.safetensors", {**weights(), "step": np.zeros(1, "i8")})
+    assert import_expert.find_expert(tmp_path / "model.safetensors", TASK)[2] == ["float32"]
+    other = {**weights(), "_pi.0.bias": np.zeros(6, "i8")}
+    write_safetensors(tmp_path / "model.safetensors", other)
+    refusal(lambda: import_expert.find_expert(tmp_path / "model.safetensors", TASK),
+            "_pi.0.bias: expected floats (6,), found I64 [6]")
 
 
 def write_safetensors(path, state):
     """The format by hand: length of the JSON header, header, data."""
     header, start = {}, 0
     for name, value in state.items():
-        header[name] = {"dtype": "F32", "shape": value.shape,
+        header[name] = {"dtype": {"f": "F32", "i": "I64"}[value.dtype.kind],
+                        "shape": value.shape,
                         "data_offsets": [start, start + value.nbytes]}
         start += value.nbytes
     encoded = json.dumps(header).encode()
@@ -390,7 +397,9 @@ def test_wrappers_within_a_name_and_dicts_within_dicts(tmp_path):
     expected = {k: v.clone() for k, v in networks.state_dict().items()}
     inner = {k.replace("_encoder.", "_encoder._orig_mod."): v for k, v in expected.items()}
     beside = {"step": 1000, "lr": 1e-3, "optimizer": adam.state_dict(), "config": {
-        "task": "walker-walk", "sizes": [50, 256], "seed": None, "nested": {"a": {"b": [1.0]}}}}
+        "task": "walker-walk", "sizes": [50, 256], "seed": None, "nested": {"a": {"b": [1.0]}}},
+        "began": 2 ** 60, "rng": torch.get_rng_state(), "done": torch.tensor(True),
+        "count": torch.tensor(3, dtype=torch.int32)}
     for saved in ({"model": expected, **beside}, {**expected, **beside}, {**inner, "step": 3},
                   {"agent": {"model": {f"module.{k}": v for k, v in inner.items()},
                              "model_target": networks.state_dict()}, **beside}):
