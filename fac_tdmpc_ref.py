@@ -1538,6 +1538,9 @@ class Workers(contextlib.AbstractContextManager):
             mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a child inherits it
             try:
                 process.start()
+            except (AttributeError, pickle.PicklingError) as error:  # a debugger's, a profiler's
+                raise UserError(f"no process can be started beside this one, as Python was started "
+                                f"here ({error}): pass workers=0, or --workers 0") from None
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, mask)
             there.close()
