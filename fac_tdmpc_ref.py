@@ -740,6 +740,11 @@ def need(condition, message):
         raise UserError(message)
 
 
+def shown(value):
+    """A value of a user's, in a message."""
+    return " ".join(repr(value).split())[:200]
+
+
 def count(value, name, most=10 ** 9):
     """The value, if it's a whole number from 0 to `most`; else UserError."""
     need(isinstance(value, (int, np.integer)) and 0 <= value <= most,
@@ -1432,14 +1437,18 @@ def useful_workers(agents):
     return min(agents, cores()) - 1
 
 
+NO_ARRAY = TypeError, ValueError, RuntimeError  # of what NumPy can't take; the last is PyTorch's
+
+
 def observed(obs, sizes, what="observation"):
     """A copy, float32 (O,): a robot may use its array again. UserError: other shape, not finite."""
     shape = (sizes.dim_obs,)
     try:
-        obs = np.array(obs, F32)
-    except (TypeError, ValueError):
-        raise UserError(f"{what}: expected numbers of shape {shape}, found what NumPy makes no "
-                        "array of them of") from None
+        with np.errstate(all="ignore"):  # what is too large is infinite
+            obs = np.array(obs, F32)
+    except NO_ARRAY:
+        raise UserError(f"{what}: expected numbers of shape {shape}, found {shown(obs)}, of "
+                        "which NumPy makes no array") from None
     need(obs.shape == shape, f"{what}: expected shape {shape}, found {obs.shape}")
     need(np.isfinite(obs).all(), f"{what}: holds values that are not finite")
     return obs
@@ -1664,8 +1673,7 @@ def task_repeat(task):
 
 def task_steps(task, config):
     """T: decisions in an episode of a task, at most, with the action repeat of a PlannerConfig."""
-    robot = make_robot(task, config.action_repeat) if is_gym(task) else config
-    return robot.episode_steps
+    return robot_steps(make_robot(task, config.action_repeat) if is_gym(task) else None, config)
 
 
 class Environment:
@@ -1698,7 +1706,7 @@ class Environment:
 
     def reset(self, seed):
         """Start the episode that the integer `seed` stands for; returns (dim O,)."""
-        self.env.task.random.seed(seed)
+        self.env.task.random.seed(seed if seed is None else count(seed, "seed", 2 ** 32 - 1))
         return self._observation(self.env.reset())
 
     def step(self, action):
@@ -1717,16 +1725,30 @@ def robot_step(robot, action, sizes, t):
     its state, beyond which nothing is worth anything: a robot's third value, if any; a fourth tells
     that the time is over. dm_control's reward of None: the next episode has begun, and all of this
     is none of ours. What goes to and fro is copied. UserError: what isn't finite."""
-    obs, reward, *ends = robot.step(np.array(action))
-    need(len(ends) < 3, f"decision {t}: expected (observation, reward), or also whether the state "
-         "ended the episode, and whether the time did")
+    answer = robot.step(np.array(action))
+    need(isinstance(answer, (tuple, list)) and 1 < len(answer) < 5 and all(
+        np.asarray(end).size == 1 and end in (False, True) for end in answer[2:]), f"decision "
+        f"{t}: expected (observation, reward), or also, True or False, whether the state ended "
+        f"the episode, and whether the time did; found {shown(answer)}")
+    obs, reward, *ends = answer
     if reward is None and t:
         return None, None, True, False
-    reward = np.asarray(reward, float)  # None is NaN
-    need(reward.size == 1 and np.isfinite(reward).all(), f"decision {t}: expected a finite reward, "
-         f"found {reward}")
+    try:
+        number = np.asarray(reward, float).item()  # None is NaN
+    except NO_ARRAY:
+        number = np.nan
+    need(np.isfinite(number), f"decision {t}: expected a finite reward, found {shown(reward)}")
     obs = observed(obs, sizes, f"decision {t}: observation")
-    return obs, reward.item(), any(ends), any(ends[:1])
+    return obs, number, any(ends), any(ends[:1])
+
+
+def robot_steps(robot, config):
+    """T of a robot: its `episode_steps`, if it has some, or a PlannerConfig's."""
+    found = getattr(robot, "episode_steps", None)
+    T = config.episode_steps if found is None else found
+    need(isinstance(T, (int, np.integer)) and T > 0, "the robot's episode_steps: expected a whole "
+         f"number above 0, found {T!r}")
+    return int(T)
 
 
 def task_names():
@@ -2006,9 +2028,10 @@ def decisions(model, task, config, seeds, environment=None, noise=0.0):
     past = np.full(sizes.dim_obs, np.nan), np.full(sizes.dim_action, np.nan), 0.0, np.nan
     for seed in seeds:
         planner.reset(seed)
-        obs, rng = observed(environment.reset(seed), sizes), stream(seed, "exploration")
+        obs = observed(environment.reset(seed), sizes, "reset: observation")
+        rng = stream(seed, "exploration")
         deviation, over = F32(rng.uniform(0, noise)), False
-        for t in range(getattr(environment, "episode_steps", config.episode_steps)):
+        for t in range(robot_steps(environment, config)):
             if over:
                 yield past
                 continue
@@ -2037,7 +2060,7 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
 
     workers: processes that share the episodes [one for each core]; 0, or with an `environment`: all
     in this one. An episode depends on its seed, not on their number. noise: as `decisions`'s."""
-    T = getattr(environment, "episode_steps", None) or task_steps(task, config)
+    T = task_steps(task, config) if environment is None else robot_steps(environment, config)
     E, sizes = len(seeds), model.config
     at_once = math.gcd(T, 25)  # decisions of a worker's message: of one episode
     found = [np.zeros((E, T, *shape), F32) for shape in ((sizes.dim_obs,), (sizes.dim_action,))]
