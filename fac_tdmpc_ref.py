@@ -1536,8 +1536,10 @@ class Workers(contextlib.AbstractContextManager):
 
     def __init__(self, target, count, name="worker"):
         context, self._name, self._members = multiprocessing.get_context("spawn"), name, []
-        need(not count or not multiprocessing.current_process().daemon, "daemonic processes, as a "
-             "multiprocessing.Pool's, can't start workers: pass workers=0")
+        usual = None, *multiprocessing.get_all_start_methods()
+        need(not count or not multiprocessing.current_process().daemon and
+             multiprocessing.get_start_method(True) in usual, "daemonic processes, as a "
+             "multiprocessing.Pool's, and joblib's can't start workers: pass workers=0")
         if getattr(main := sys.modules["__main__"], "__file__", "") == "<stdin>":
             del main.__file__  # or children look for it
         for _ in range(count):
