@@ -2626,7 +2626,10 @@ def run_command(parser, argv=None):
             error = f"{error.filename}: can't be read or written: {error.strerror}"
         elif isinstance(error, OSError):  # a full stdout's, which would fail again at the end
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        print(f"{parser.prog}: error: {str(error) or 'not enough memory'}", file=sys.stderr)
+        try:
+            print(f"{parser.prog}: error: {str(error) or 'not enough memory'}", file=sys.stderr)
+        except OSError:  # its reader is gone, as head's
+            os.dup2(1, 2)
         return 2
     except KeyboardInterrupt:
         print(f"{parser.prog}: interrupted; the same command goes on from its last checkpoint, "
