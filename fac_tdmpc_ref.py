@@ -1843,6 +1843,7 @@ def locked(folder):
     the process, however that ends; where the system or the folder's disk has none, there is none.
     """
     Path(folder).mkdir(parents=True, exist_ok=True)
+    check_writable(Path(folder) / "...")
     with contextlib.ExitStack() as stack:
         try:
             import fcntl

@@ -826,6 +826,13 @@ def test_two_runs_into_one_folder_do_not_both_begin(tmp_path, files, capsys):
         assert main([str(a) for a in (*arguments, "--out", free)]) == 0 and os.listdir(free)
 
 
+@pytest.mark.skipif(not os.path.exists("/proc/self"), reason="no folder in which nobody may write")
+def test_a_folder_that_nobody_can_write_into_is_missed_before_the_work(files, capsys):
+    assert fac.main([str(a) for a in distill_arguments(files, "--out", "/proc/self")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "/proc/self/...: can't be written: " in line
+
+
 @pytest.mark.parametrize("missing", ["fcntl", "the disk's locks"])
 def test_where_there_are_no_locks_a_run_goes_on(tmp_path, monkeypatch, missing):
     import fcntl
