@@ -1810,6 +1810,8 @@ def training_seeds(seed, use, first, count):
 # ==== 11. Files: weights, replay, records =============================================
 
 FORMAT = "fac-tdmpc-ref 1"
+MADE = ("files are made by distill, data/train_expert.py and, of others' checkpoints and data, "
+        "data/import_expert.py")
 
 
 @contextlib.contextmanager
@@ -1873,14 +1875,14 @@ def read_npz(path, kinds):
         raise UserError(f"{path}: no such file") from None
     except Exception as error:  # a damaged file can raise nearly anything
         reason = " ".join(str(error).split()).split(". ")[0]  # NumPy advises to load it unsafely
-        raise UserError(f"{path}: not a readable .npz file ({reason})") from None
+        raise UserError(f"{path}: not a readable .npz file ({reason}); {MADE}") from None
     try:
         header = json.loads(arrays.pop("header").tobytes())
         if not isinstance(header, dict):
             raise ValueError
     except (KeyError, ValueError, RecursionError):
-        raise UserError(f"{path}: header: expected a JSON entry of this name, found none; files "
-                        f"are made by data/train_expert.py and distill") from None
+        raise UserError(f"{path}: header: expected a JSON entry of this name, found none; {MADE}"
+                        ) from None
     need(header.get("format") == FORMAT, f"{path}: header: format: expected {FORMAT!r}, found "
          f"{header.get('format')!r}; a newer version's file needs that version of this project")
     need(header.get("kind") in kinds, f"{path}: header: kind: expected {' or '.join(kinds)!r}, "
