@@ -1156,6 +1156,11 @@ class Distiller:
     def add(self, observation, action):
         """Let episodes (E, T, O), (E, T, A), NaN past their ends, join `played`, the rows
         (all, O + A) of episodes of `lengths` [D8]; those of H decisions or fewer are left out."""
+        shapes = np.shape(observation), np.shape(action)
+        expected = [(*shapes[0][:2], n) for n in (self.replay.dim_obs, self.replay.dim_action)]
+        need([*shapes] == expected and len(shapes[0]) == 3, "played episodes: expected shapes "
+             f"(E, T, {expected[0][-1]}) and (E, T, {expected[1][-1]}), found "
+             f"{shapes[0]} and {shapes[1]}")
         episodes, L = np.concatenate([observation, action], 2), self.config.horizon + 1
         good = np.isfinite(observation).all(2) & (np.abs(action) <= 1).all(2)
         past = np.logical_and.accumulate(np.isnan(episodes).all(2)[:, ::-1], 1)[:, ::-1]
