@@ -1445,18 +1445,22 @@ def useful_workers(agents):
 NO_ARRAY = TypeError, ValueError, RuntimeError  # of what NumPy can't take; the last is PyTorch's
 
 
-def observed(obs, sizes, what="observation"):
-    """A copy, float32 (O,): a robot may use its array again. UserError: other shape, not finite."""
-    shape = (sizes.dim_obs,)
+def checked(values, shape, what, dtype=F32):
+    """A copy of values of this shape. UserError: of another one, not finite."""
     try:
         with np.errstate(all="ignore"):  # what is too large is infinite
-            obs = np.array(obs, F32)
+            found = np.array(values, dtype)
     except NO_ARRAY:
-        raise UserError(f"{what}: expected numbers of shape {shape}, found {shown(obs)}, of "
+        raise UserError(f"{what}: expected numbers of shape {shape}, found {shown(values)}, of "
                         "which NumPy makes no array") from None
-    need(obs.shape == shape, f"{what}: expected shape {shape}, found {obs.shape}")
-    need(np.isfinite(obs).all(), f"{what}: holds values that are not finite")
-    return obs
+    need(found.shape == shape, f"{what}: expected shape {shape}, found {found.shape}")
+    need(np.isfinite(found).all(), f"{what}: holds values that are not finite")
+    return found
+
+
+def observed(obs, sizes, what="observation"):
+    """A copy, float32 (O,): a robot may use its array again. UserError: other shape, not finite."""
+    return checked(obs, (sizes.dim_obs,), what)
 
 
 class Planner(contextlib.ExitStack):  # whose `close` ends the workers
@@ -1717,8 +1721,10 @@ class Environment:
         return self._observation(self.env.reset())
 
     def step(self, action):
-        """Apply action (dim A,); returns next observation (dim O,) and the sum of the rewards."""
-        control, reward = self._low + self._scale * (np.asarray(action, np.float64) + 1), 0.0
+        """Apply action (dim A,); returns next observation (dim O,) and the sum of the rewards.
+        UserError: the action has another shape or isn't finite, or the episode is over."""
+        action = checked(action, (self.dim_action,), "action", np.float64)
+        control, reward = self._low + self._scale * (action + 1), 0.0
         for _ in range(self.action_repeat):
             timestep = self.env.step(control)
             need(timestep.reward is not None, f"the episode is over ({self.episode_steps} "

@@ -340,6 +340,17 @@ def test_an_environment_says_that_its_episode_is_over(repeat, begin):
     env.step(np.zeros(3))
 
 
+@pytest.mark.parametrize("action, part", [
+    (0.5, "expected shape (6,), found ()"), (np.zeros(1), "found (1,)"), (np.zeros(5), "(5,)"),
+    ([np.nan] * 6, "not finite"), (None, "found ()"), ("left", "found 'left', of which NumPy")])
+def test_an_environment_refuses_what_is_no_action(action, part):
+    env = environment("walker-walk")
+    env.reset(0)
+    with pytest.raises(fac.UserError, match="^action: ") as caught:
+        env.step(action)
+    assert part in str(caught.value)
+
+
 def test_actions_are_scaled_to_the_action_spec(monkeypatch):
     from dm_control import suite
     low, high, received = np.array([-2.0, 0, 1, 5]), np.array([3.0, 10, 2, 7]), []
