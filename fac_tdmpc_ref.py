@@ -1559,8 +1559,8 @@ class Workers(contextlib.AbstractContextManager):
             try:
                 process.start()
             except (AttributeError, pickle.PicklingError) as error:  # a debugger's, a profiler's
-                raise UserError(f"no process can be started beside this one, as Python was started "
-                                f"here ({error}): pass workers=0, or --workers 0") from None
+                raise UserError("no process can be started beside one that a debugger or profiler "
+                                f"runs ({error}): run it without, or pass workers=0") from None
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, mask)
             there.close()
