@@ -741,6 +741,11 @@ def need(condition, message):
         raise UserError(message)
 
 
+def shown(value):
+    """A value of a user's, in a message."""
+    return " ".join(repr(value).split())[:200]
+
+
 def count(value, name, most=10 ** 9):
     """The value, if it's a whole number from 0 to `most`; else UserError."""
     need(isinstance(value, (int, np.integer)) and 0 <= value <= most,
@@ -1154,6 +1159,11 @@ class Distiller:
     def add(self, observation, action):
         """Let episodes (E, T, O), (E, T, A), NaN past their ends, join `played`, the rows
         (all, O + A) of episodes of `lengths` [D8]; those of H decisions or fewer are left out."""
+        shapes = np.shape(observation), np.shape(action)
+        expected = [(*shapes[0][:2], n) for n in (self.replay.dim_obs, self.replay.dim_action)]
+        need([*shapes] == expected and len(shapes[0]) == 3, "played episodes: expected shapes "
+             f"(E, T, {expected[0][-1]}) and (E, T, {expected[1][-1]}), found "
+             f"{shapes[0]} and {shapes[1]}")
         episodes, L = np.concatenate([observation, action], 2), self.config.horizon + 1
         good = np.isfinite(observation).all(2) & (np.abs(action) <= 1).all(2)
         past = np.logical_and.accumulate(np.isnan(episodes).all(2)[:, ::-1], 1)[:, ::-1]
@@ -1437,17 +1447,25 @@ def useful_workers(agents):
     return min(agents, cores()) - 1
 
 
+NO_ARRAY = TypeError, ValueError, RuntimeError  # of what NumPy can't take; the last is PyTorch's
+
+
+def checked(values, shape, what, dtype=F32):
+    """A copy of values of this shape. UserError: of another one, not finite."""
+    try:
+        with np.errstate(all="ignore"):  # what is too large is infinite
+            found = np.array(values, dtype)
+    except NO_ARRAY:
+        raise UserError(f"{what}: expected numbers of shape {shape}, found {shown(values)}, of "
+                        "which NumPy makes no array") from None
+    need(found.shape == shape, f"{what}: expected shape {shape}, found {found.shape}")
+    need(np.isfinite(found).all(), f"{what}: holds values that are not finite")
+    return found
+
+
 def observed(obs, sizes, what="observation"):
     """A copy, float32 (O,): a robot may use its array again. UserError: other shape, not finite."""
-    shape = (sizes.dim_obs,)
-    try:
-        obs = np.array(obs, F32)
-    except (TypeError, ValueError):
-        raise UserError(f"{what}: expected numbers of shape {shape}, found what NumPy makes no "
-                        "array of them of") from None
-    need(obs.shape == shape, f"{what}: expected shape {shape}, found {obs.shape}")
-    need(np.isfinite(obs).all(), f"{what}: holds values that are not finite")
-    return obs
+    return checked(obs, (sizes.dim_obs,), what)
 
 
 class Planner(contextlib.ExitStack):  # whose `close` ends the workers
@@ -1532,8 +1550,10 @@ class Workers(contextlib.AbstractContextManager):
 
     def __init__(self, target, count, name="worker"):
         context, self._name, self._members = multiprocessing.get_context("spawn"), name, []
-        need(not count or not multiprocessing.current_process().daemon, "daemonic processes, as a "
-             "multiprocessing.Pool's, can't start workers: pass workers=0")
+        usual = None, *multiprocessing.get_all_start_methods()
+        need(not count or not multiprocessing.current_process().daemon and
+             multiprocessing.get_start_method(True) in usual, "daemonic processes, as a "
+             "multiprocessing.Pool's, and joblib's can't start workers: pass workers=0")
         if getattr(main := sys.modules["__main__"], "__file__", "") == "<stdin>":
             del main.__file__  # or children look for it
         for _ in range(count):
@@ -1543,6 +1563,9 @@ class Workers(contextlib.AbstractContextManager):
             mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a child inherits it
             try:
                 process.start()
+            except (AttributeError, pickle.PicklingError) as error:  # a debugger's, a profiler's
+                raise UserError("no process can be started beside one that a debugger or profiler "
+                                f"runs ({error}): run it without, or pass workers=0") from None
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, mask)
             there.close()
@@ -1666,8 +1689,7 @@ def task_repeat(task):
 
 def task_steps(task, config):
     """T: decisions in an episode of a task, at most, with the action repeat of a PlannerConfig."""
-    robot = make_robot(task, config.action_repeat) if is_gym(task) else config
-    return robot.episode_steps
+    return robot_steps(make_robot(task, config.action_repeat) if is_gym(task) else None, config)
 
 
 class Environment:
@@ -1700,12 +1722,14 @@ class Environment:
 
     def reset(self, seed):
         """Start the episode that the integer `seed` stands for; returns (dim O,)."""
-        self.env.task.random.seed(seed)
+        self.env.task.random.seed(seed if seed is None else count(seed, "seed", 2 ** 32 - 1))
         return self._observation(self.env.reset())
 
     def step(self, action):
-        """Apply action (dim A,); returns next observation (dim O,) and the sum of the rewards."""
-        control, reward = self._low + self._scale * (np.asarray(action, np.float64) + 1), 0.0
+        """Apply action (dim A,); returns next observation (dim O,) and the sum of the rewards.
+        UserError: the action has another shape or isn't finite, or the episode is over."""
+        action = checked(action, (self.dim_action,), "action", np.float64)
+        control, reward = self._low + self._scale * (action + 1), 0.0
         for _ in range(self.action_repeat):
             timestep = self.env.step(control)
             need(timestep.reward is not None, f"the episode is over ({self.episode_steps} "
@@ -1719,16 +1743,30 @@ def robot_step(robot, action, sizes, t):
     its state, beyond which nothing is worth anything: a robot's third value, if any; a fourth tells
     that the time is over. dm_control's reward of None: the next episode has begun, and all of this
     is none of ours. What goes to and fro is copied. UserError: what isn't finite."""
-    obs, reward, *ends = robot.step(np.array(action))
-    need(len(ends) < 3, f"decision {t}: expected (observation, reward), or also whether the state "
-         "ended the episode, and whether the time did")
+    answer = robot.step(np.array(action))
+    need(isinstance(answer, (tuple, list)) and 1 < len(answer) < 5 and all(
+        np.asarray(end).size == 1 and end in (False, True) for end in answer[2:]), f"decision "
+        f"{t}: expected (observation, reward), or also, True or False, whether the state ended "
+        f"the episode, and whether the time did; found {shown(answer)}")
+    obs, reward, *ends = answer
     if reward is None and t:
         return None, None, True, False
-    reward = np.asarray(reward, float)  # None is NaN
-    need(reward.size == 1 and np.isfinite(reward).all(), f"decision {t}: expected a finite reward, "
-         f"found {reward}")
+    try:
+        number = np.asarray(reward, float).item()  # None is NaN
+    except NO_ARRAY:
+        number = np.nan
+    need(np.isfinite(number), f"decision {t}: expected a finite reward, found {shown(reward)}")
     obs = observed(obs, sizes, f"decision {t}: observation")
-    return obs, reward.item(), any(ends), any(ends[:1])
+    return obs, number, any(ends), any(ends[:1])
+
+
+def robot_steps(robot, config):
+    """T of a robot: its `episode_steps`, if it has some, or a PlannerConfig's."""
+    found = getattr(robot, "episode_steps", None)
+    T = config.episode_steps if found is None else found
+    need(isinstance(T, (int, np.integer)) and T > 0, "the robot's episode_steps: expected a whole "
+         f"number above 0, found {T!r}")
+    return int(T)
 
 
 def task_names():
@@ -1788,6 +1826,8 @@ def training_seeds(seed, use, first, count):
 # ==== 11. Files: weights, replay, records =============================================
 
 FORMAT = "fac-tdmpc-ref 1"
+MADE = ("files are made by distill, data/train_expert.py and, of others' checkpoints and data, "
+        "data/import_expert.py")
 
 
 @contextlib.contextmanager
@@ -1821,6 +1861,7 @@ def locked(folder):
     the process, however that ends; where the system or the folder's disk has none, there is none.
     """
     Path(folder).mkdir(parents=True, exist_ok=True)
+    check_writable(Path(folder) / "...")
     with contextlib.ExitStack() as stack:
         try:
             import fcntl
@@ -1850,14 +1891,14 @@ def read_npz(path, kinds):
         raise UserError(f"{path}: no such file") from None
     except Exception as error:  # a damaged file can raise nearly anything
         reason = " ".join(str(error).split()).split(". ")[0]  # NumPy advises to load it unsafely
-        raise UserError(f"{path}: not a readable .npz file ({reason})") from None
+        raise UserError(f"{path}: not a readable .npz file ({reason}); {MADE}") from None
     try:
         header = json.loads(arrays.pop("header").tobytes())
         if not isinstance(header, dict):
             raise ValueError
     except (KeyError, ValueError, RecursionError):
-        raise UserError(f"{path}: header: expected a JSON entry of this name, found none; files "
-                        f"are made by data/train_expert.py and distill") from None
+        raise UserError(f"{path}: header: expected a JSON entry of this name, found none; {MADE}"
+                        ) from None
     need(header.get("format") == FORMAT, f"{path}: header: format: expected {FORMAT!r}, found "
          f"{header.get('format')!r}; a newer version's file needs that version of this project")
     need(header.get("kind") in kinds, f"{path}: header: kind: expected {' or '.join(kinds)!r}, "
@@ -2008,9 +2049,10 @@ def decisions(model, task, config, seeds, environment=None, noise=0.0):
     past = np.full(sizes.dim_obs, np.nan), np.full(sizes.dim_action, np.nan), 0.0, np.nan
     for seed in seeds:
         planner.reset(seed)
-        obs, rng = observed(environment.reset(seed), sizes), stream(seed, "exploration")
+        obs = observed(environment.reset(seed), sizes, "reset: observation")
+        rng = stream(seed, "exploration")
         deviation, over = F32(rng.uniform(0, noise)), False
-        for t in range(getattr(environment, "episode_steps", config.episode_steps)):
+        for t in range(robot_steps(environment, config)):
             if over:
                 yield past
                 continue
@@ -2039,7 +2081,7 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
 
     workers: processes that share the episodes [one for each core]; 0, or with an `environment`: all
     in this one. An episode depends on its seed, not on their number. noise: as `decisions`'s."""
-    T = getattr(environment, "episode_steps", None) or task_steps(task, config)
+    T = task_steps(task, config) if environment is None else robot_steps(environment, config)
     E, sizes = len(seeds), model.config
     at_once = math.gcd(T, 25)  # decisions of a worker's message: of one episode
     found = [np.zeros((E, T, *shape), F32) for shape in ((sizes.dim_obs,), (sizes.dim_action,))]
@@ -2605,7 +2647,10 @@ def run_command(parser, argv=None):
             error = f"{error.filename}: can't be read or written: {error.strerror}"
         elif isinstance(error, OSError):  # a full stdout's, which would fail again at the end
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        print(f"{parser.prog}: error: {str(error) or 'not enough memory'}", file=sys.stderr)
+        try:
+            print(f"{parser.prog}: error: {str(error) or 'not enough memory'}", file=sys.stderr)
+        except OSError:  # its reader is gone, as head's
+            os.dup2(1, 2)
         return 2
     except KeyboardInterrupt:
         print(f"{parser.prog}: interrupted; the same command goes on from its last checkpoint, "

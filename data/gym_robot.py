@@ -34,7 +34,7 @@ class GymRobot:
             warnings.simplefilter("ignore")  # that there is a newer version of the ID
             try:
                 self.env = gymnasium.make(name, disable_env_checker=True)
-            except Exception as error:  # a robot's constructor can raise anything
+            except (Exception, SystemExit) as error:  # a constructor, or a script, can raise any
                 raise ValueError(" ".join(str(error).split())[:300] or repr(error)) from None
         steps = self.env.spec.max_episode_steps
         if steps is None:
@@ -47,10 +47,19 @@ class GymRobot:
             raise ValueError("actions: expected floats with finite bounds, to which [-1, 1] is "
                              "scaled; gymnasium.wrappers.RescaleAction gives some")
         self.dim_action = self._space.shape[0]
+        try:  # an older Gym's robots have other signatures
+            self.reset(0)
+            self.step(np.zeros(self.dim_action))
+        except Exception as error:
+            raise ValueError(f"its first step: {' '.join(repr(error).split())[:300]}; expected "
+                             "Gymnasium's reset(seed=..., options=...) -> (observation, info) and "
+                             "step(action) -> five values, of which the reward is a number"
+                             ) from None
 
     def reset(self, seed):
         """Start the episode that the integer `seed` stands for; returns (dim O,)."""
-        return self.env.reset(seed=int(seed))[0]
+        obs, _ = self.env.reset(seed=int(seed))
+        return obs
 
     def step(self, action):
         """Apply action (dim A,); returns next observation, the sum of the rewards, whether the

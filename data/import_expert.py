@@ -100,8 +100,9 @@ def unpack(archive, member):
     return data
 
 
-NPY = re.compile(rb"\x93NUMPY\x01\x00(..)\{'descr': '([<>|](?:f[248]|[bui]1))', 'fortran_order': "
-                 rb"(True|False), 'shape': \((\d{1,9}(?:, \d{1,9})*),?\), \} *\n", re.DOTALL)
+NPY = re.compile(rb"\x93NUMPY\x01\x00(..)\{'descr': '([<>|](?:f[248]|b1|[iu][148]))', "
+                 rb"'fortran_order': (True|False), 'shape': \((\d{1,9}(?:, \d{1,9})*),?\), \} *\n",
+                 re.DOTALL)
 
 
 Unread = namedtuple("Unread", "reason")  # an entry that matters only if it is asked for
@@ -115,7 +116,7 @@ def read_npz(path):
         if name == "header":  # in this project's own files
             continue
         if not match or match.end() != 10 + int.from_bytes(match[1], "little"):
-            found[name] = Unread("no array of floats or bools as numpy.savez writes it")
+            found[name] = Unread("no array of numbers as numpy.savez writes it")
             continue
         shape, dtype = [int(n) for n in match[4].split(b", ")], np.dtype(match[2].decode())
         if (0 < math.prod(shape) * dtype.itemsize == len(data) - match.end() and
@@ -135,10 +136,11 @@ Storage = namedtuple("Storage", "data dtype")  # a tensor's memory: a member's b
 
 # NumPy has no bfloat16: unsigned integers, which are read for nothing else, stand for it
 STORAGES = {"torch DoubleStorage": "f8", "torch FloatStorage": "f4", "torch HalfStorage": "f2",
-            "torch BFloat16Storage": "u2", "torch LongStorage": "i8"}
+            "torch BFloat16Storage": "u2", "torch LongStorage": "i8", "torch IntStorage": "i4",
+            "torch ByteStorage": "u1", "torch BoolStorage": "b1"}
 OPCODES = set("""PROTO NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 BINFLOAT BINUNICODE EMPTY_DICT
 MARK EMPTY_LIST APPEND APPENDS EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 BINPUT LONG_BINPUT BINGET
-LONG_BINGET SETITEM SETITEMS BUILD GLOBAL REDUCE BINPERSID""".split())
+LONG1 LONG_BINGET SETITEM SETITEMS BUILD GLOBAL REDUCE BINPERSID""".split())
 CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
 
 
@@ -177,7 +179,7 @@ def read_pickle(data, members, byteorder):
                 need(argument == 2, "has another protocol than 2")
             case "NONE" | "NEWTRUE" | "NEWFALSE" | "EMPTY_TUPLE":
                 stack.append(CONSTANTS[name])
-            case "BININT" | "BININT1" | "BININT2" | "BINFLOAT" | "BINUNICODE":
+            case "BININT" | "BININT1" | "BININT2" | "LONG1" | "BINFLOAT" | "BINUNICODE":
                 stack.append(argument)
             case "EMPTY_DICT":
                 stack.append({})
@@ -304,16 +306,15 @@ def read_safetensors(path):
     except Exception as error:  # the library's own, mostly
         raise fac.UserError(f"not a readable safetensors file ({short(error)})") from None
     kinds = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "BF16": "<u2"}
-    for name, t in found:
-        need(t["dtype"] in kinds and len(t["shape"]) <= MAX_RANK and t["data"], f"{short(name)}: "
-             f"expected {', '.join(kinds)}, found {t['dtype']} {t['shape'][:MAX_RANK]}")
-    return {name: np.ndarray(t["shape"], kinds[t["dtype"]], t["data"]) for name, t in found}
+    return {name: np.ndarray(t["shape"], kinds[t["dtype"]], t["data"])
+            if t["dtype"] in kinds and len(t["shape"]) <= MAX_RANK and t["data"] else
+            Unread(f"{t['dtype']} {t['shape'][:MAX_RANK]}") for name, t in found}
 
 
 # ------------------------------------------------------------------------------------ HDF5
 
 OWN = {"observation": "observations", "action": "actions", "continues": None}  # and D4RL's name
-D4RL_ENDS = "terminals", "timeouts"
+D4RL_ENDS = "terminals", "timeouts", "terminations", "truncations"  # the last two: Gymnasium's
 
 
 def read_hdf5(path):
@@ -427,7 +428,7 @@ def is_weight(value):
 
 def described(value):
     """What a message says of what a file holds under a name."""
-    return (f"{value.dtype} {value.shape}" if type(value) is np.ndarray else
+    return (f"{value.dtype.name} {value.shape}" if type(value) is np.ndarray else
             value.reason if type(value) is Unread else
             "nothing" if value is None else type(value).__name__)
 
@@ -493,6 +494,8 @@ def find_replay(path, sizes):
         for key in OWN:
             need(key in found, f"{key}: not there, only {', '.join(map(short, [*found][:9]))}")
         rows = getattr(found["continues"], "size", 0)
+        need(rows, "continues: expected bools, a row or more, found "
+             f"{described(found['continues'])}")
         for key, kind, shape in (("continues", "bool", (rows,)),
                                  ("observation", "float", (rows, sizes.dim_obs)),
                                  ("action", "float", (rows, sizes.dim_action))):
@@ -513,7 +516,11 @@ def find_replay(path, sizes):
 def from_d4rl(found):
     """D4RL's arrays by this project's names: an episode's last row is one of `terminals` or
     `timeouts`, or the file's, whose action goes unused, for what follows it isn't there."""
-    ends = [np.ravel(found[key]) != 0 for key in D4RL_ENDS if type(found.get(key)) is np.ndarray]
+    there = [key for key in D4RL_ENDS if key in found]
+    for key in there:  # an end that isn't read would join two episodes
+        need(type(found[key]) is np.ndarray and found[key].size, f"{key}: expected numbers or "
+             f"bools, found {described(found[key])}")
+    ends = [np.ravel(found[key]) != 0 for key in there]
     need(ends and len({len(end) for end in ends}) == 1, f"expected {' or '.join(D4RL_ENDS)}, "
          f"equally long, found {', '.join(map(short, [*found][:9]))}")
     continues = ~np.logical_or.reduce(ends)
@@ -566,7 +573,6 @@ def run(args):
                 np.array_equal(there[k], weights[k]) for k in there),
                 f"{path}: another expert, which would be replaced; choose another --out")
             header = {**before, **header}
-        fac.check_writable(out / "expert.npz")
         if environment:
             with tempfile.TemporaryDirectory() as scratch:  # an expert is replaced with its replay
                 fac.write_npz(path := Path(scratch) / "expert.npz", header, weights)

@@ -141,6 +141,7 @@ class Learner:
         self.slow_vector, slow = fac.flatten(self.optimizer.params)
         self.target = fac.WorldModel(sizes, slow)
 
+    @fac.one_thread()
     def update(self, obs, actions, reward, rng, continues=1.0):
         """One step of Equation 1, one of the policy; every `target_every` times the averages.
 

@@ -52,7 +52,8 @@ class Episode:
     def __init__(self, environment, seed, player=None, exploration_std=None):
         self.environment, self.seed, self.player = environment, seed, player
         self.exploration_std, self.rng = exploration_std, fac.stream(seed, "exploration")
-        self.observation = [fac.observed(environment.reset(seed), environment)]
+        self.observation = [fac.observed(environment.reset(seed), environment,
+                                         "reset: observation")]
         self.action, self.reward, self.over, self.terminated = [], [], False, False
         self._warm_start = None
 

@@ -37,6 +37,24 @@ class Told(Walk):
             setattr(self, f"{name}_space", space)
 
 
+class Older(Walk):
+    """Of an older Gym's signatures, or without a reward, as an option says."""
+
+    def __init__(self, odd):
+        super().__init__()
+        self.odd = odd
+
+    def reset(self, *, options=None, **seed):
+        if self.odd == "seed" and seed:
+            raise TypeError("reset() got an unexpected keyword argument 'seed'")
+        obs, info = super().reset(**seed)
+        return obs if self.odd == "reset" else (obs, info)
+
+    def step(self, action):
+        obs, _, *ends = super().step(action)
+        return (obs, 1.0, *ends[1:]) if self.odd == "step" else (obs, None, *ends)
+
+
 SPACES = {
     "Discrete": {"action": Discrete(3)}, "Dict": {"observation": Dict({"a": Box(0, 1, (2,))})},
     "Image": {"observation": Box(0, 255, (8, 8, 3), np.uint8)},
@@ -47,5 +65,7 @@ if "Walk-v0" not in gymnasium.registry:
     gymnasium.register("Walk-v0", Walk, max_episode_steps=12)
     gymnasium.register("Stroll-v0", Walk, max_episode_steps=12, kwargs={"falls": False})
     gymnasium.register("Endless-v0", Walk, kwargs={"falls": False})
+    for odd in ("seed", "reset", "step", "reward"):
+        gymnasium.register(f"Older-{odd}-v0", Older, max_episode_steps=12, kwargs={"odd": odd})
     for name, spaces in SPACES.items():
         gymnasium.register(f"{name}-v0", Told, max_episode_steps=12, kwargs=spaces)

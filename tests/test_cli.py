@@ -587,6 +587,21 @@ def test_a_script_on_standard_input_may_have_workers(tmp_path):
     assert succeeded(done).stdout == "(3,)\n"
 
 
+def test_under_a_debugger_a_process_that_cannot_start_is_one_line():
+    """pdb's __main__ has no __spec__."""
+    code = ("import numpy as np, fac_tdmpc_ref as fac\n"
+            "model = fac.WorldModel.create(fac.ModelConfig(8, 3, 3, 4, 8, 8), "
+            "np.random.default_rng(0))\n"
+            "del __spec__\n"
+            "try:\n"
+            "    fac.Planner(model, workers=1)\n"
+            "except fac.UserError as error:\n"
+            "    print(error)\n")
+    done = subprocess.run([sys.executable, "-"], input=code, capture_output=True, text=True,
+                          cwd=ROOT, timeout=60, env={**os.environ, **ONE_THREAD})
+    assert "pass workers=0" in succeeded(done).stdout and done.stdout.count("\n") == 1
+
+
 def test_progress_goes_to_whatever_stands_for_stderr(monkeypatch):
     written = []
     for stream in (None, SimpleNamespace(write=written.append, flush=lambda: None)):
@@ -813,6 +828,13 @@ def test_two_runs_into_one_folder_do_not_both_begin(tmp_path, files, capsys):
     for i, (main, arguments) in enumerate(runs):
         free = f"{out}{i}" if i else out
         assert main([str(a) for a in (*arguments, "--out", free)]) == 0 and os.listdir(free)
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self"), reason="no folder in which nobody may write")
+def test_a_folder_that_nobody_can_write_into_is_missed_before_the_work(files, capsys):
+    assert fac.main([str(a) for a in distill_arguments(files, "--out", "/proc/self")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "/proc/self/...: can't be written: " in line
 
 
 @pytest.mark.parametrize("missing", ["fcntl", "the disk's locks"])

@@ -154,6 +154,10 @@ def test_a_file_that_is_no_npz(tmp_path, content):
 
 def test_a_folder_is_no_npz(tmp_path):
     refusal(lambda: fac.load_model(tmp_path), tmp_path, "not a readable .npz file")
+    np.savez(tmp_path / "d4rl.npz", observations=np.zeros((2, 3)))
+    refusal(lambda: fac.Replay(tmp_path / "d4rl.npz"), "header: ", "data/import_expert.py")
+    (tmp_path / "d4rl.hdf5").write_bytes(b"\x89HDF\r\n\x1a\n")
+    refusal(lambda: fac.Replay(tmp_path / "d4rl.hdf5"), "d4rl.hdf5", "data/import_expert.py")
 
 
 def test_a_single_array_is_no_npz(tmp_path):

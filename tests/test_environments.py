@@ -271,11 +271,43 @@ def test_a_robot_that_begins_the_next_episode_by_itself_ends_the_one_before():
     (lambda t: (np.nan if t == 9 else 1.0,), ["decision 8:", "finite reward", "nan"]),
     (lambda t: (None,), ["decision 0:", "finite reward"]),
     (lambda t: (np.ones(2),), ["decision 0:", "finite reward"]),
-    (lambda t: (1.0, False, False, {}), ["decision 0:", "(observation, reward)"])])
+    (lambda t: ("good",), ["decision 0:", "finite reward", "'good'"]),
+    (lambda t: ({"r": 1},), ["decision 0:", "finite reward", "{'r': 1}"]),
+    (lambda t: (), ["decision 0:", "(observation, reward)", "found (array("]),
+    (lambda t: (1.0, False, False, {}), ["decision 0:", "(observation, reward)"]),
+    (lambda t: (1.0, False, {"an older Gym's": 1}), ["decision 0:", "True or False", "older Gym"]),
+    (lambda t: (1.0, np.nan), ["decision 0:", "True or False", "nan"])])
 def test_what_a_robot_answers_is_refused_by_decision(answer, parts):
     with pytest.raises(fac.UserError) as caught:
         play_robot(Robot(answer))
     assert all(part in str(caught.value) for part in parts) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("end", [True, 1, 1.0, np.True_, np.array([True])])
+def test_what_ends_an_episode_may_be_of_any_type_that_is_true_or_false(end):
+    assert play_robot(Robot(lambda t: (1.0, end)))[2].sum(1).tolist() == [1, 1]
+
+
+@pytest.mark.parametrize("steps", [0, -1, 200.0, "200"])
+def test_an_episode_of_no_number_of_decisions_is_refused(steps):
+    robot = Robot()
+    robot.episode_steps = steps
+    with pytest.raises(fac.UserError, match="episode_steps: expected a whole number above 0"):
+        play_robot(robot)
+
+
+def test_what_answers_nothing_of_use_is_refused_at_reset_too():
+    robot = Robot()
+    for step in (None, 1.0):
+        robot.step = lambda action, step=step: step
+        with pytest.raises(fac.UserError, match="decision 0: expected .observation, reward"):
+            play_robot(robot)
+    for first, part in ((np.full(3, np.nan), "not finite"), ((np.zeros(3), {}), "(array(["),
+                        (np.full(3, 1e300), "not finite")):
+        robot.reset = lambda seed, first=first: first
+        with np.errstate(all="raise"), pytest.raises(fac.UserError, match="reset: obs") as caught:
+            play_robot(robot)
+        assert part in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("obs, part", [(np.full(3, np.inf), "not finite"), (np.zeros(4), "(4,)"),
@@ -286,6 +318,12 @@ def test_an_observation_is_refused_by_decision(obs, part):
     with pytest.raises(fac.UserError, match="decision 4: observation") as caught:
         play_robot(robot)
     assert part in str(caught.value)
+
+
+@pytest.mark.parametrize("seed", [-1, 2 ** 32, 1.5])
+def test_a_seed_that_is_none_is_refused(seed):
+    with pytest.raises(fac.UserError, match="seed: expected a whole number"):
+        environment("reacher-easy").reset(seed)
 
 
 @pytest.mark.parametrize("repeat, begin", [(2, False), (8, True)])
@@ -300,6 +338,17 @@ def test_an_environment_says_that_its_episode_is_over(repeat, begin):
         env.step(np.zeros(3))
     env.reset(0)
     env.step(np.zeros(3))
+
+
+@pytest.mark.parametrize("action, part", [
+    (0.5, "expected shape (6,), found ()"), (np.zeros(1), "found (1,)"), (np.zeros(5), "(5,)"),
+    ([np.nan] * 6, "not finite"), (None, "found ()"), ("left", "found 'left', of which NumPy")])
+def test_an_environment_refuses_what_is_no_action(action, part):
+    env = environment("walker-walk")
+    env.reset(0)
+    with pytest.raises(fac.UserError, match="^action: ") as caught:
+        env.step(action)
+    assert part in str(caught.value)
 
 
 def test_actions_are_scaled_to_the_action_spec(monkeypatch):

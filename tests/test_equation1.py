@@ -171,6 +171,13 @@ def test_the_averages_follow_every_second_update():
     assert learner.slow_vector.dtype == learner.optimizer.vector.dtype == np.float32
 
 
+def test_a_learner_goes_on_where_numpy_is_set_to_raise():
+    rng = np.random.default_rng(0)
+    learner, (obs, *more) = small_learner(rng, np.float32), small_batch(rng, dtype=np.float32)
+    with np.errstate(all="raise"):  # what exp underflows
+        assert np.isfinite(learner.update(1e4 * obs, *more, rng)).all()
+
+
 def test_a_learner_goes_on_from_its_state():
     """Weights, both of Adam's means, steps made and moving averages."""
     first, second = (small_learner(np.random.default_rng(seed), np.float32) for seed in (6, 7))

@@ -318,13 +318,20 @@ def test_safetensors_by_hand_and_without_the_library(tmp_path, monkeypatch):
     _, found, kinds = import_expert.find_expert(tmp_path / "model.safetensors", TASK)
     assert kinds == ["float32"]
     assert all(np.array_equal(found[k], v) for k, v in weights().items())
+    write_safetensors(tmp_path / "model.safetensors", {**weights(), "step": np.zeros(1, "i8")})
+    assert import_expert.find_expert(tmp_path / "model.safetensors", TASK)[2] == ["float32"]
+    other = {**weights(), "_pi.0.bias": np.zeros(6, "i8")}
+    write_safetensors(tmp_path / "model.safetensors", other)
+    refusal(lambda: import_expert.find_expert(tmp_path / "model.safetensors", TASK),
+            "_pi.0.bias: expected floats (6,), found I64 [6]")
 
 
 def write_safetensors(path, state):
     """The format by hand: length of the JSON header, header, data."""
     header, start = {}, 0
     for name, value in state.items():
-        header[name] = {"dtype": "F32", "shape": value.shape,
+        header[name] = {"dtype": {"f": "F32", "i": "I64"}[value.dtype.kind],
+                        "shape": value.shape,
                         "data_offsets": [start, start + value.nbytes]}
         start += value.nbytes
     encoded = json.dumps(header).encode()
@@ -390,7 +397,9 @@ def test_wrappers_within_a_name_and_dicts_within_dicts(tmp_path):
     expected = {k: v.clone() for k, v in networks.state_dict().items()}
     inner = {k.replace("_encoder.", "_encoder._orig_mod."): v for k, v in expected.items()}
     beside = {"step": 1000, "lr": 1e-3, "optimizer": adam.state_dict(), "config": {
-        "task": "walker-walk", "sizes": [50, 256], "seed": None, "nested": {"a": {"b": [1.0]}}}}
+        "task": "walker-walk", "sizes": [50, 256], "seed": None, "nested": {"a": {"b": [1.0]}}},
+        "began": 2 ** 60, "rng": torch.get_rng_state(), "done": torch.tensor(True),
+        "count": torch.tensor(3, dtype=torch.int32)}
     for saved in ({"model": expected, **beside}, {**expected, **beside}, {**inner, "step": 3},
                   {"agent": {"model": {f"module.{k}": v for k, v in inner.items()},
                              "model_target": networks.state_dict()}, **beside}):
@@ -842,7 +851,7 @@ def refuse_replay(path, arrays, change, part):
     refusal(lambda: import_expert.find_replay(path, SIZES), path.name, part)
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.float16])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.float16, np.dtype(">f8")])
 def test_a_replay_is_converted_and_distils(tmp_path, dtype, capsys):
     arrays = replay_arrays(dtype=dtype)
     np.savez(tmp_path / "data.npz", **arrays)
@@ -873,6 +882,7 @@ def test_a_replay_is_converted_and_distils(tmp_path, dtype, capsys):
     (lambda a: a.update(continues=a["continues"] * 1.0), "continues: expected bool"),
     (lambda a: a.update(continues=a["continues"][:-1]), "(139, 8), found float64 (140, 8)"),
     (lambda a: a.update(continues=a["continues"][:, None]), "continues: expected bool (140,)"),
+    (lambda a: a.update(continues=a["continues"][:0]), "continues: expected bools, a row or more"),
     (lambda a: a["continues"].__setitem__(-1, True), "continues: row 139, the last: expected"),
     (lambda a: a["observation"].__setitem__((5, 2), 1e39), "tion: row 5, column 2: inf is"),
     (lambda a: a["observation"].__setitem__((7, 0), np.nan), "row 7, column 0: nan is not"),
@@ -912,12 +922,16 @@ def d4rl_arrays(rows=140, every=7):
             "timeouts": last & ~odd, "rewards": np.zeros(rows, np.float32)}
 
 
-@pytest.mark.parametrize("suffix, kind", [(".npz", bool), (".npz", np.uint8), (".npz", np.float32),
-                                          (".hdf5", bool), (".h5", np.int64)])
-def test_d4rl_s_arrays_are_taken_by_their_names(tmp_path, suffix, kind):
+@pytest.mark.parametrize("suffix, kind, names", [
+    (".npz", bool, ("terminals", "timeouts")), (".npz", np.uint8, ("terminals", "timeouts")),
+    (".npz", np.float32, ("terminals", "timeouts")), (".npz", np.int64, ("terminals", "timeouts")),
+    (".npz", np.int32, ("terminations", "truncations")), (".hdf5", bool, ("terminals", "timeouts")),
+    (".h5", np.int64, ("terminals", "truncations"))])
+def test_d4rl_s_arrays_are_taken_by_their_names(tmp_path, suffix, kind, names):
+    """And Gymnasium's."""
     arrays, path = d4rl_arrays(), tmp_path / f"data{suffix}"
-    for key in ("terminals", "timeouts"):
-        arrays[key] = arrays[key].astype(kind)
+    for key, name in zip(("terminals", "timeouts"), names):
+        arrays[name] = arrays.pop(key).astype(kind)
     if suffix == ".npz":
         np.savez(path, **arrays)
     else:
@@ -938,6 +952,8 @@ def test_d4rl_s_arrays_are_taken_by_their_names(tmp_path, suffix, kind):
 @pytest.mark.parametrize("change, part", [
     (lambda a: [a.pop("terminals"), a.pop("timeouts")], "expected terminals or timeouts"),
     (lambda a: a.update(timeouts=a["timeouts"][1:]), "equally long"),
+    (lambda a: a.update(timeouts=a["timeouts"].astype(object)), "timeouts: expected numbers"),
+    (lambda a: a.update(terminals=a["terminals"][:0]), "terminals: expected numbers or bools"),
     (lambda a: a.pop("actions"), "action: not there")])
 def test_other_arrays_of_d4rl_are_refused(tmp_path, change, part):
     refuse_replay(tmp_path / "data.npz", d4rl_arrays(), change, part)

@@ -412,6 +412,13 @@ def test_a_pool_s_process_that_wants_workers_is_told_to_go_without():
         assert pool.apply(in_a_pool, [0]) == [(3,), 1]
 
 
+def test_joblib_s_process_that_wants_workers_is_told_to_go_without():
+    joblib = pytest.importorskip("joblib")
+    refused, played = joblib.Parallel(2)(joblib.delayed(in_a_pool)(n) for n in (1, 0))
+    assert all(message.endswith("pass workers=0") for message in refused)
+    assert played == [(3,), 1]
+
+
 @pytest.mark.parametrize("seed", [-1, 1.5, "x"])
 def test_what_is_no_seed_is_refused_and_leaves_no_worker(seed):
     before = multiprocessing.active_children()
