@@ -890,10 +890,10 @@ def planning_numbers(sizes, config):
 # ==== 7. Added to the paper: more states [D8], credit, a search around the policy [D9] =
 
 # how a student plans that was taught around its expert's policy, if its file says nothing else
-STUDENT_PLANNING = {"prior": "policy", "max_std": 0.15, "samples": 16, "iterations": 2,
+STUDENT_PLANNING = {"prior": "policy", "max_std": 0.15, "samples": 32, "iterations": 3,
                     "output": "mean"}
-WELL_RANKED = 0.75  # see `student_search`
-WIDE_SEARCH = {"max_std": 1.0, "samples": 32, "iterations": 3}
+WELL_RANKED, WIDE_SEARCH = 0.75, {"max_std": 1.0}  # see `student_search`
+MANY_AGENTS, SMALL_SEARCH = 12, {"samples": 16, "iterations": 2}
 
 
 def student_planning(config):
@@ -902,11 +902,13 @@ def student_planning(config):
     return STUDENT_PLANNING if config.policy_share else {}
 
 
-def student_search(rank):
+def student_search(rank, agents):
     """What a student plans with instead, by its held-out rank correlation of G over H [D9]: who
-    ranks plans well finds better ones far from the policy, with more samples; others only what
-    their errors promise."""
-    return WIDE_SEARCH if rank >= WELL_RANKED else {}
+    ranks plans well finds better ones far from the policy; others only what their errors promise.
+    A narrow search of many agents, where samples cost most, needs fewer."""
+    if rank >= WELL_RANKED:
+        return WIDE_SEARCH
+    return SMALL_SEARCH if agents >= MANY_AGENTS else {}
 
 
 def agent_order(sizes):
@@ -2403,7 +2405,7 @@ def distil_and_save(distiller, args, planning, header, out):
     curve, seconds, before = train_student(distiller, out, settings, planning, args.workers)
     ranks = rank_results(distiller, 256, planning.discount)
     if planning.prior == "policy":
-        search = student_search(ranks["rank_correlation_returns"][-1])
+        search = student_search(ranks["rank_correlation_returns"][-1], sizes.num_agents)
         planning = from_args(PlannerConfig, args, **{**asdict(planning), **search})
     save_model(out / "student.npz", student, {
         "kind": "student", **settings, "training": header.get("training", {}),
@@ -2412,7 +2414,8 @@ def distil_and_save(distiller, args, planning, header, out):
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
             "steps": config.steps, "seconds": round(seconds, 1), "seconds_total": before,
             "kl_reward": curve[-1][3], "kl_value": curve[-1][4],
-            **ranks, **{name: getattr(planning, name) for name in WIDE_SEARCH}, "out": str(out),
+            **ranks, "max_std": planning.max_std, "samples": planning.samples,
+            "iterations": planning.iterations, "out": str(out),
             "picture": drawn(draw_curve, out / "curve.png", curve,
                              f"{args.task}, seed {args.seed}")}, planning
 
@@ -2589,9 +2592,9 @@ def make_parser():
                       "factored student (Algorithm 1), then evaluate and time both with MPPI.",
                       epilog="Given again, a cut-off run goes on; a finished one is evaluated. "
                       f"A student whose rank correlation of G is {WELL_RANKED} or more in held-out "
-                      "states searches with " + ", ".join(
-                          f"--plan-{name.replace('_', '-')} {value}"
-                          for name, value in WIDE_SEARCH.items()) + ", unless told otherwise.")
+                      f"states searches with --plan-max-std {WIDE_SEARCH['max_std']}; another of "
+                      f"{MANY_AGENTS} agents or more with --plan-samples {SMALL_SEARCH['samples']} "
+                      f"--plan-iterations {SMALL_SEARCH['iterations']}; unless told otherwise.")
     add = sub.add_argument
     add("--task", default="reacher-hard", help="one of: " + task_names())
     add("--seed", type=natural, default=0, help="of distillation [0]")

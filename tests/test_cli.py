@@ -411,7 +411,7 @@ def test_distill_prints_json_and_a_table(distilled):
 
 
 @pytest.mark.parametrize("flags, rank, expected", [
-    ([], fac.WELL_RANKED, (1.0, 32, 3)), ([], fac.WELL_RANKED - 0.01, (0.15, 16, 2)),
+    ([], fac.WELL_RANKED, (1.0, 32, 3)), ([], fac.WELL_RANKED - 0.01, (0.15, 32, 3)),
     (["--plan-max-std", "0.3"], fac.WELL_RANKED, (0.3, 32, 3)),
     (["--plan-samples", "8"], fac.WELL_RANKED, (1.0, 8, 3)),
     (["--preset", "plain"], fac.WELL_RANKED, (2.0, 128, 4)),
@@ -434,6 +434,12 @@ def test_who_ranks_plans_well_searches_widely(
     for found in (json.loads(capsys.readouterr().out), header["planner"], *planned):
         assert tuple(found[name] for name in ("max_std", "samples", "iterations")) == expected
     assert len(planned) == 1
+
+
+def test_many_agents_search_with_fewer_samples_where_they_search_narrowly():
+    for rank, agents, expected in ((0.7, 11, {}), (0.7, 12, {"samples": 16, "iterations": 2}),
+                                   (0.8, 12, {"max_std": 1.0}), (0.8, 3, {"max_std": 1.0})):
+        assert fac.student_search(rank, agents) == expected
 
 
 def test_part_one_alone_distils_and_goes_on_from_its_end(tmp_path, files):
