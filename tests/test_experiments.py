@@ -992,7 +992,8 @@ def test_report_draws_what_the_csvs_hold(tmp_path):
     assert row["task"] == "walker-run" and row["ratio"] == 6.0 and row["ratio_in_process"] == 3.0
     assert row["expert"] == {"samples": 64, "iterations": 6, "ms": 12.0, "return": 96.0}
     assert row["student"] == {"samples": 16, "iterations": 6, "ms": 2.0, "return": 97.0}
-    assert list(found.pop("students")) == ["walker-run, 128 x 4", "walker-run, 512 x 6"]
+    assert list(found.pop("students")) == [
+        "walker-run", "walker-run, samples 512, iterations 6"]
     assert sorted(os.listdir(tmp_path / "pictures")) == sorted(f"{k}.png" for k in found)
     text = (tmp_path / "report.md").read_text(encoding="utf-8")
     for part in ("## Figure 13", "809 / 836 / 697 / 560", "11 ± 1 (2)", "pictures/figure7.png"):
