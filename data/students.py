@@ -59,7 +59,7 @@ def measured(rows, of):
 
 
 def cells(rows):
-    """A preset's cells of the table, of {evaluation seed: rows by seed}."""
+    """A line's HEADS, of {evaluation seed: rows by seed}."""
     if not all(rows[seed] for seed in EVALUATION_SEEDS):
         return ["-"] * len(HEADS)
     first, students = rows[0], sum(rows.values(), [])
@@ -74,28 +74,27 @@ def cells(rows):
             f"{np.mean([float(row['minutes']) for row in first]):.0f}"]
 
 
+def line_of(row):
+    """What a row's line of the table is called: the task; its preset, unless that's the default;
+    what flags chose of its planning."""
+    about, preset = json.loads(row["settings"]), row["case"]
+    return ", ".join([row["task"], *[preset][:preset != "default"], *(
+        f"{name} {about[name]}" for name in ("samples", "iterations") if name in about)])
+
+
 def table(rows, authors):
-    """The README's main table, {task, and what flags chose of its planning: {preset: cells}}, and
-    Markdown: a line for each, columns for each preset. authors: {task: text}."""
-    runs, presets = {}, list(dict.fromkeys(row["case"] for row in rows))
+    """The README's main table, {line: {head: cell}}, and Markdown. authors: {task: text}."""
+    runs, lines, result = {}, [], {}
     for row in rows:
-        about = json.loads(row["settings"])
-        chosen = [f"{name} {about[name]}" for name in ("samples", "iterations") if name in about]
-        runs.setdefault((row["task"], *chosen), {}).setdefault(
-            row["case"], {seed: [] for seed in EVALUATION_SEEDS})[
+        runs.setdefault(line_of(row), {seed: [] for seed in EVALUATION_SEEDS})[
             int(row["evaluation_seed"])].append(row)
-    lines, result = [], {}
-    for (task, *chosen), found in runs.items():
-        row = next(iter(found.values()))[0][0]
+    for line, found in runs.items():
+        row = sum(found.values(), [])[0]
         policy = json.loads(row["policy_returns"])
-        own = {preset: cells(found[preset]) for preset in found}
-        result[", ".join([task, *chosen])] = own
-        lines.append([", ".join([task, *chosen]), json.loads(row["settings"])["num_agents"],
+        result[line] = dict(zip(HEADS, cells(found)))
+        lines.append([line, json.loads(row["settings"])["num_agents"],
                       mean_and_spread(json.loads(row["expert_returns"]), np.std),
                       mean_and_spread(policy, np.std) if policy else "-",
-                      *sum((own.get(preset, ["-"] * len(HEADS)) for preset in presets), []),
-                      authors.get(task, "-")])
-    return result, markdown([
-        "task", "N", "expert", "its policy alone",
-        *(f"{head}, {preset}" if len(presets) > 1 else head for preset in presets
-          for head in HEADS), "authors' logs: 100% TD-MPC / Fac-TDMPC"], lines)
+                      *result[line].values(), authors.get(row["task"], "-")])
+    return result, markdown(["task", "N", "expert", "its policy alone", *HEADS,
+                             "authors' logs: 100% TD-MPC / Fac-TDMPC"], lines)
