@@ -312,7 +312,8 @@ def command_figure10(args):
     done = experiments.finished(experiments.read_rows(result["out"]))
     found = over_tasks({key: done[key] for key in map(experiments.key_of, runs)}, args.tasks)
     experiments.draw_lines(args.picture, {
-        title: (cases, cases[TEACHER][config.steps][0]) for title, cases in found.items()},
+        title: ({case: cases[case] for case in cases if case != TEACHER},  # which is the level
+                cases[TEACHER][config.steps][0]) for title, cases in found.items()},
         "gradient step")
     print_figure10(found, marked(config.steps))
     compared, picture = {}, Path(args.picture).with_name(f"{Path(args.picture).stem}-latents.png")

@@ -56,6 +56,7 @@ def draw_lines(path, panels, xlabel, **axes):
     plt = fac.pyplot()
     labels = list(dict.fromkeys(label for lines, _ in panels.values() for label in lines))
     cycle, columns = list(plt.rcParams["axes.prop_cycle"]), min(4, len(panels))
+    alike, handles = len(labels) <= len(cycle), {}  # one style for a label in all panels?
     figure, grid = plt.subplots(-(-len(panels) // columns), columns, squeeze=False,
                                 figsize=(3.6 * columns, 3.8 * -(-len(panels) // columns)),
                                 layout="constrained")
@@ -64,7 +65,7 @@ def draw_lines(path, panels, xlabel, **axes):
         if lines is None:
             ax.remove()
             continue
-        order = labels if len(labels) <= len(cycle) else list(lines)  # one style, one line
+        order = labels if alike else list(lines)  # one style, one line
         for label, points in lines.items():
             style = cycle[order.index(label) % len(cycle)]
             x = sorted(points)
@@ -80,7 +81,12 @@ def draw_lines(path, panels, xlabel, **axes):
             ax.minorticks_off()
         else:
             ax.locator_params("x", nbins=5)
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, fontsize=8)
+        if not alike:
+            ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, fontsize=8)
+        handles.update((label, handle) for handle, label in zip(*ax.get_legend_handles_labels()))
+    if alike:
+        figure.legend(handles.values(), handles, loc="outside lower center", fontsize=8,
+                      ncols=2 * columns)
     fac.drawn(fac.save_figure, path, figure)
 
 
