@@ -171,8 +171,9 @@ def stream(seed, use, index=0):
 ENCODER = ("linear", "elu", "linear")
 MLP = ("linear", "elu", "linear", "elu", "linear")
 QNET = ("linear", "norm", "tanh", "linear", "elu", "linear")
-HEADS = (("_reward", MLP), ("_Q1", QNET), ("_Q2", QNET))
-NETWORKS = {"_encoder": ENCODER, "_dynamics": MLP, "_pi": MLP, **dict(HEADS)}
+NETWORKS = {"_encoder": ENCODER, "_dynamics": MLP, "_reward": MLP, "_Q1": QNET, "_Q2": QNET,
+            "_pi": MLP}
+HEADS = ("_reward", "_Q1", "_Q2")
 NORM_EPS = 1e-5  # PyTorch's LayerNorm
 POLICY_STD, POLICY_CUT = 0.05, 0.3  # of TD-MPC's policy noise: deviation, and where it is cut
 
@@ -336,7 +337,7 @@ class WorldModel:
         """Fresh weights: orthogonal, biases zero, last layer of reward and Q zero (TD-MPC)."""
         params = {}
         for name, i, kind, shape, last in layers(config, policy):
-            zero = last and name in ("_reward", "_Q1", "_Q2")
+            zero = last and name in HEADS
             params[f"{name}.{i}.weight"] = (
                 np.ones(shape, dtype) if kind == "norm" else
                 np.zeros(shape, dtype) if zero else orthogonal(rng, *shape, dtype))
@@ -390,27 +391,26 @@ class WorldModel:
 
 
 def networks(config, policy=False):
-    """(name, layer kinds, agents, widths) of every network of a model."""
+    """(name, agents, widths) of every network of a model."""
     n, m, hidden = config.num_agents, config.latent_dim, (config.mlp_dim, config.mlp_dim)
     d, latent = config.agent_actions, config.expert_latent_dim
-    found = [("_encoder", ENCODER, 1, (latent or config.dim_obs, config.enc_dim, n * m)),
-             ("_dynamics", MLP, n, (m + d, *hidden, m)),
-             *((name, kinds, n, (m + d, *hidden, 1)) for name, kinds in HEADS)]
+    found = [("_encoder", 1, (latent or config.dim_obs, config.enc_dim, n * m)),
+             ("_dynamics", n, (m + d, *hidden, m)),
+             *((name, n, (m + d, *hidden, 1)) for name in HEADS)]
     if policy:
-        found.append(("_pi", MLP, n, (m, *hidden, d)))
+        found.append(("_pi", n, (m, *hidden, d)))
     if latent:
-        found.append(("_expert_encoder", ENCODER, 1,
-                      (config.dim_obs, config.expert_enc_dim, latent)))
+        found.append(("_expert_encoder", 1, (config.dim_obs, config.expert_enc_dim, latent)))
     if latent and (width := config.expert_mlp_dim):
-        found += [("_expert_dynamics", MLP, 1, (latent + config.dim_action, width, width, latent)),
-                  ("_expert_pi", MLP, 1, (latent, width, width, config.dim_action))]
+        found += [("_expert_dynamics", 1, (latent + config.dim_action, width, width, latent)),
+                  ("_expert_pi", 1, (latent, width, width, config.dim_action))]
     return found
 
 
 def layers(config, policy=False):
     """(network, index, kind, weight shape, whether it is the last) of every layer with weights."""
-    for name, kinds, agents, widths in networks(config, policy):
-        before, *after = widths
+    for name, agents, (before, *after) in networks(config, policy):
+        kinds = NETWORKS[name.removeprefix("_expert")]
         for i, kind in enumerate(kinds):
             if kind == "linear":
                 yield name, i, kind, (agents, after[0], before), i == len(kinds) - 1
@@ -423,8 +423,7 @@ def unroll(model, z, actions, tapes=None):
     """Roll a model's latent out under given actions; all h side by side, so that heads run once.
 
     z (N, m, B), actions (L, A, B, K): K perturbed copies of a trajectory. Returns the networks'
-    input x (N, m + d, L * B * K), columns in the order (L, B, K), with s_{h+1} = f_T(s_h, a_h).
-    tapes, for `unroll_backward`: "_dynamics h" for each h."""
+    input x (N, m + d, L * B * K), columns in the order (L, B, K); tapes, "_dynamics h" for h."""
     L, _, B, K = actions.shape
     n, m, d = model.config.num_agents, model.config.latent_dim, model.config.agent_actions
     x = np.empty((n, m + d, L * B * K), z.dtype)
@@ -441,7 +440,7 @@ def run_heads(model, x, actions, tapes=None):
     """Every agent's share of reward and both Q at `unroll`'s x: three (N, L, B, K)."""
     L, _, B, K = actions.shape
     return [model.forward(name, x, None if tapes is None else tapes[name])
-            .reshape(-1, L, B, K) for name, _ in HEADS]
+            .reshape(-1, L, B, K) for name in HEADS]
 
 
 def predict(model, z, actions, tapes=None):
@@ -454,7 +453,7 @@ def heads_backward(model, tapes, d_shares, grads):
     """Walk `run_heads` back: adds to `grads`, returns dx (N, m + d, L * B * K). d_shares: gradients
     by each share (N, L, B, K), or by sums of shares (fewer rows), the same for each summand."""
     n, dx = model.config.num_agents, 0
-    for (name, _), d in zip(HEADS, d_shares):
+    for name, d in zip(HEADS, d_shares):
         d = np.repeat(d, n // len(d), 0).reshape(n, 1, -1)
         dx = dx + model.backward(name, tapes[name], d, grads)
     return dx

@@ -55,8 +55,8 @@ def rollout(params, z, actions):
     z, outputs = z.repeat_interleave(noise, 1), []
     for h in range(steps):
         x = torch.cat([z, actions[h].reshape(len(z), -1, batch * noise).mT], -1)
-        outputs.append([network(kinds, params, name, x).view(-1, batch, noise)
-                        for name, kinds in fac.HEADS])
+        outputs.append([network(fac.NETWORKS[name], params, name, x).view(-1, batch, noise)
+                        for name in fac.HEADS])
         z = transition(params, x)
     return [torch.stack(head, 1) for head in zip(*outputs)]
 

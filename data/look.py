@@ -137,7 +137,6 @@ def pyplot_for(path):
     return fac.pyplot()
 
 
-NOISE = fac.DistillConfig.noise_std  # around what is done, for the additive ceiling
 def need_sklearn():
     """UserError, before the work, if scikit-learn is missing."""
     with fac.optional("scikit-learn", "experiments"):
@@ -279,6 +278,9 @@ def plan_gains(expert, model, config, obs, seed=0):
         G = [fac.horizon_returns(*fac.predict(*of), config.discount)[-1]
              for of in ((expert, z, both[:, robot]), (model, own, both))]
     return [g[:, 0] - g[:, 1] for g in G]
+
+
+NOISE = fac.DistillConfig.noise_std  # around what is done, for the additive ceiling
 
 
 def additive_ceiling(expert, obs, actions, noise, discount, rng, copies=1024):

@@ -68,7 +68,7 @@ def _prediction_worker(connection):
 def multiply_adds(config, planner):
     """Multiply-adds of a decision's networks, as Equation 2 reads (none saved)."""
     cost = {name: agents * sum(a * b for a, b in zip(widths, widths[1:]))
-            for name, _, agents, widths in fac.networks(config)}
+            for name, agents, widths in fac.networks(config)}
     step, value = cost["_dynamics"] + cost["_reward"], cost["_Q1"] + cost["_Q2"]
     return planner.samples * planner.iterations * (planner.horizon * step + value)
 

@@ -49,9 +49,9 @@ def norm(x, W, b):
     return F.layer_norm(x, x.shape[-1:]) * W.mT + b.mT
 
 
-def heads(params, x, networks=fac.HEADS):
+def heads(params, x, names=fac.HEADS):
     """Global reward and both Q, or those named: sums over agents, (B,) each, of x (N, B, m + d)."""
-    return [network(kinds, params, name, x).sum(0)[:, 0] for name, kinds in networks]
+    return [network(fac.NETWORKS[name], params, name, x).sum(0)[:, 0] for name in names]
 
 
 def transition(params, x):

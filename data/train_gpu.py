@@ -157,7 +157,7 @@ class Learner:
     def q(self, p, z, a):
         """Both Q (T, B)."""
         x = self.torch.cat([z, a], -1)
-        return [self.net(kinds, p, name, x)[..., 0] for name, kinds in fac.HEADS[1:]]
+        return [self.net(fac.NETWORKS[name], p, name, x)[..., 0] for name in fac.HEADS[1:]]
 
     def policy_noise(self, *shape):
         noise = self.torch.randn(*shape, self.dim_action, device=self.device)

@@ -225,8 +225,8 @@ class TorchDistiller:
         outputs = []
         for a in actions:
             x = torch.cat([z, a.transpose(0, 1)], -1)
-            outputs.append([run_network(kinds, params, name, x).sum(0)[:, 0]
-                            for name, kinds in fac.HEADS])
+            outputs.append([run_network(fac.NETWORKS[name], params, name, x).sum(0)[:, 0]
+                            for name in fac.HEADS])
             z = run_network(fac.MLP, params, "_dynamics", x)
         return [torch.stack(head) for head in zip(*outputs)]
 

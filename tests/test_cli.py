@@ -582,30 +582,30 @@ def test_numpy_may_be_set_to_raise(tmp_path, files):
             np.exp(np.float32(-1e3))
 
 
-def test_a_script_on_standard_input_may_have_workers(tmp_path):
-    code = ("import numpy as np, fac_tdmpc_ref as fac\n"
-            "model = fac.WorldModel.create(fac.ModelConfig(8, 3, 3, 4, 8, 8), "
-            "np.random.default_rng(0))\n"
-            "with fac.Planner(model, fac.PlannerConfig(samples=8), workers=1) as planner:\n"
-            "    print(planner.act(np.zeros(8)).shape)\n")
-    done = subprocess.run([sys.executable, "-"], input=code, capture_output=True, text=True,
-                          cwd=ROOT, timeout=60, env={**os.environ, **ONE_THREAD})
-    assert succeeded(done).stdout == "(3,)\n"
+def on_standard_input(code):
+    """What a script with a small model prints."""
+    model = ("import numpy as np, fac_tdmpc_ref as fac\n"
+             "model = fac.WorldModel.create(fac.ModelConfig(8, 3, 3, 4, 8, 8), "
+             "np.random.default_rng(0))\n")
+    return succeeded(subprocess.run(
+        [sys.executable, "-"], input=model + code, capture_output=True, text=True, cwd=ROOT,
+        timeout=60, env={**os.environ, **ONE_THREAD})).stdout
+
+
+def test_a_script_on_standard_input_may_have_workers():
+    assert on_standard_input(
+        "with fac.Planner(model, fac.PlannerConfig(samples=8), workers=1) as planner:\n"
+        "    print(planner.act(np.zeros(8)).shape)\n") == "(3,)\n"
 
 
 def test_under_a_debugger_a_process_that_cannot_start_is_one_line():
     """pdb's __main__ has no __spec__."""
-    code = ("import numpy as np, fac_tdmpc_ref as fac\n"
-            "model = fac.WorldModel.create(fac.ModelConfig(8, 3, 3, 4, 8, 8), "
-            "np.random.default_rng(0))\n"
-            "del __spec__\n"
-            "try:\n"
-            "    fac.Planner(model, workers=1)\n"
-            "except fac.UserError as error:\n"
-            "    print(error)\n")
-    done = subprocess.run([sys.executable, "-"], input=code, capture_output=True, text=True,
-                          cwd=ROOT, timeout=60, env={**os.environ, **ONE_THREAD})
-    assert "pass workers=0" in succeeded(done).stdout and done.stdout.count("\n") == 1
+    printed = on_standard_input("del __spec__\n"
+                                "try:\n"
+                                "    fac.Planner(model, workers=1)\n"
+                                "except fac.UserError as error:\n"
+                                "    print(error)\n")
+    assert "pass workers=0" in printed and printed.count("\n") == 1
 
 
 def test_progress_goes_to_whatever_stands_for_stderr(monkeypatch):
