@@ -1861,7 +1861,6 @@ def locked(folder):
     """Make a folder and keep other runs out of it; UserError where one is in it. The lock ends with
     the process, however that ends; where the system or the folder's disk has none, there is none.
     """
-    Path(folder).mkdir(parents=True, exist_ok=True)
     check_writable(Path(folder) / "...")
     with contextlib.ExitStack() as stack:
         try:
@@ -2375,12 +2374,18 @@ def load_data(args):
          f"{header.get('task')!r}")
     check_task(expert.config, args.task)
     make_robot(args.task)  # what is missing is missed now, not after the last step
-    replay = Replay(args.replay or path.with_name("replay.npz"))
-    repeat = made_for(header, path).get("action_repeat", ACTION_REPEAT)
-    found = made_for(replay.header, replay.path).get("action_repeat", repeat)
-    need(found == repeat, f"{replay.path}: header: action_repeat: expected {repeat}, as the expert "
-         f"was made for, found {found}; pass its own data")
+    replay = load_replay(args.replay or path.with_name("replay.npz"),
+                         made_for(header, path).get("action_repeat", ACTION_REPEAT))
     return expert, header, replay, path
+
+
+def load_replay(path, repeat):
+    """A Replay whose file names no other action repeat than this."""
+    replay = Replay(path)
+    found = made_for(replay.header, path).get("action_repeat", repeat)
+    need(found == repeat, f"{path}: header: action_repeat: expected {repeat}, as the expert was "
+         f"made for, found {found}; pass its own data")
+    return replay
 
 
 def distil_and_save(distiller, args, planning, header, out):

@@ -79,11 +79,7 @@ def load_data(task, args, checkpoint, seed, folder):
     if args.collect:
         path = collect(expert, task, args.collect, seed, folder)
     fac.need(path.exists(), f"{path}: no such file; --collect 20 has the teacher play instead")
-    replay = fac.Replay(path)
-    found = fac.made_for(replay.header, path).get("action_repeat", fac.ACTION_REPEAT)
-    fac.need(found == fac.ACTION_REPEAT, f"{path}: header: action_repeat: expected "
-             f"{fac.ACTION_REPEAT}, as TD-MPC2's, found {found}; pass --collect 20")
-    return expert, fac.PlannerConfig(), replay
+    return expert, fac.PlannerConfig(), fac.load_replay(path, fac.ACTION_REPEAT)
 
 
 def collect(expert, task, episodes, seed, folder):
