@@ -294,7 +294,7 @@ def distil(task, seed, case, settings):
 
 FIGURE4 = {"Fac-TDMPC": {}, "100% TD-MPC": {"num_agents": 1}, "10% TD-MPC": {}, "TAP": {}}
 FIGURE5 = {  # panel: {case: settings}; every panel holds the default
-    "loss": {"default": {}, "MSE": {"targets": "joint"}},
+    "loss": {"default": {}, "joint targets": {"targets": "joint"}, "MSE": {"targets": "joint"}},
     "noise deviation": {"default": {}, **{f"noise {x}": {"noise_std": x} for x in (0.1, 1.0, 2.0)}},
     "student temperature": {"default": {}, **{f"T_s {x}": {"temperature_student": x}
                                               for x in (0.1, 2.0)}},
@@ -845,8 +845,8 @@ def make_parser():
              "Section 5.2: Fac-TDMPC, TD-MPC in Table 2's size and the small one of B.2, and TAP, "
              "by Algorithm 1; return against steps.", shipped, **curve)
     add_runs("figure5", lambda args: distil_all(args, lambda _: FIGURE5_CASES.items()),
-             "Section 5.3: KL against MSE, the perturbations' deviation (clipped), the student's "
-             "temperature, a consistency loss.", walkers, **curve)
+             "Section 5.3: KL against MSE (and without credit), the perturbations' deviation "
+             "(clipped), the student's temperature, a consistency loss.", walkers, **curve)
     add_runs("departures", command_departures, "The differences in distillation one at a time, "
              "towards the paper's values.", ["reacher-hard", "walker-walk"],
              steps=5000, evaluations=1, episodes=10)

@@ -725,8 +725,9 @@ def test_the_cases_of_figure_5_learn_what_they_say():
     assert kinds.pop("MSE") is baselines.MSEDistiller
     assert kinds.pop("consistency") is baselines.ConsistentDistiller
     assert kinds.pop("consistency 0.03") is baselines.LightlyConsistentDistiller
-    assert set(kinds.values()) == {fac.Distiller} and len(kinds) == 6
+    assert set(kinds.values()) == {fac.Distiller} and len(kinds) == 7
     assert {k: v for k, v in experiments.FIGURE5_CASES.items() if v} == {
+        "joint targets": {"targets": "joint"},
         "MSE": {"targets": "joint"},  # values, not what changes them
         **{f"noise {x}": {"noise_std": x} for x in (0.1, 1.0, 2.0)},
         **{f"T_s {x}": {"temperature_student": x} for x in (0.1, 2.0)}}
