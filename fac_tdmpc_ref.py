@@ -1861,6 +1861,7 @@ def locked(folder):
     """Make a folder and keep other runs out of it; UserError where one is in it. The lock ends with
     the process, however that ends; where the system or the folder's disk has none, there is none.
     """
+    Path(folder).mkdir(parents=True, exist_ok=True)
     check_writable(Path(folder) / "...")
     with contextlib.ExitStack() as stack:
         try:
