@@ -12,7 +12,8 @@ from tables import deviation, markdown, of_returns  # noqa: E402
 EVALUATION_SEEDS = (0, 1)
 MEASURED = ("rank_correlation", "plan_ms", "samples", "iterations")  # what a row keeps
 HEADS = ("seeds", "MPPI", "student", "kept, evaluation seeds 0 / 1", "least kept",
-         "speed-up, one core", "rank correlation of G, H = 0 / last", "minutes")
+         "planning wins, expert / student", "speed-up, one core",
+         "rank correlation of G, H = 0 / last", "minutes")
 FLAGS = {"samples": "plan-samples", "iterations": "plan-iterations", "num_agents": "num-agents"}
 
 
@@ -53,6 +54,15 @@ def kept(rows):
     return np.nan if found is None else found
 
 
+def planning_wins(rows, key):
+    """What planning with a model, whose returns are `key`'s, wins over the expert's policy in the
+    same episodes: its mean ± standard error over episodes. rows: {evaluation seed: rows by seed}"""
+    found = [np.mean([np.subtract(json.loads(row[key]), json.loads(row["policy_returns"]))
+                      for row in rows[seed]], 0) for seed in EVALUATION_SEEDS]
+    found = np.concatenate(found)
+    return f"{found.mean():.0f} ± {found.std(ddof=1) / len(found) ** 0.5:.0f}"
+
+
 def measured(rows, of):
     """The mean over seeds of what `of` makes of each row's MEASURED, a dict."""
     return np.mean([of(json.loads(row["ranks"])) for row in rows])
@@ -69,7 +79,10 @@ def cells(rows):
     returns = [float(row["return_mean"]) for row in first]
     return [len(first), budget, mean_and_spread(returns, deviation),
             " / ".join(f"{kept(rows[seed]):.2f}" for seed in EVALUATION_SEEDS),
-            f"{min(kept([row]) for row in students):.2f}", f"{faster:.1f}",
+            f"{min(kept([row]) for row in students):.2f}",
+            "-" if "[]" in (row["policy_returns"] for row in students) else " / ".join(
+                planning_wins(rows, key) for key in ("expert_returns", "returns")),
+            f"{faster:.1f}",
             " / ".join(f"{x:.2f}" for x in ranks),
             f"{np.mean([float(row['minutes']) for row in first]):.0f}"]
 

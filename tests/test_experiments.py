@@ -1034,6 +1034,8 @@ def test_the_table_of_students_has_a_line_for_each_preset_and_each_chosen_budget
     assert own["speed-up, one core"] == "4.5" and (own["seeds"], own["minutes"]) == ("2", "6")
     assert own["kept, evaluation seeds 0 / 1"] == "0.70 / 0.90"
     assert own["least kept"] == "0.60"  # of each seed's two: 0.80, 0.60; 1.00, 0.80
+    # 110, -60 twice; each episode's mean over the two seeds: 70, -95, 135, -110
+    assert own["planning wins, expert / student"] == "25 ± 49 / 0 ± 61"
     assert own["rank correlation of G, H = 0 / last"] == "0.90 / 0.50"
     assert own["authors' logs: 100% TD-MPC / Fac-TDMPC"] == "836 / 809"
     assert (paper["task"], paper["seeds"], paper["MPPI"]) == ("walker-run, paper", "1", "512 x 6")
