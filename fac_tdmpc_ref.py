@@ -891,7 +891,7 @@ def planning_numbers(sizes, config):
 # how a student plans that was taught around its expert's policy, if its file says nothing else
 STUDENT_PLANNING = {"prior": "policy", "max_std": 0.15, "samples": 32, "iterations": 3,
                     "output": "mean"}
-WELL_RANKED, WIDE_SEARCH = 0.75, {"max_std": 1.0}  # see `student_search`
+WIDE_SEARCH = {"max_std": 1.0}  # see `student_search`
 MANY_AGENTS, SMALL_SEARCH = 12, {"samples": 16, "iterations": 2}
 
 
@@ -899,15 +899,6 @@ def student_planning(config):
     """Settings of a PlannerConfig that students distilled with this config plan with [D9]: around
     the expert's policy, where they were taught around it; else as any model."""
     return STUDENT_PLANNING if config.policy_share else {}
-
-
-def student_search(rank, agents):
-    """What a student plans with instead, by its held-out rank correlation of G over H [D9]: who
-    ranks plans well finds better ones far from the policy; others only what their errors promise.
-    A narrow search of many agents, where samples cost most, needs fewer."""
-    if rank >= WELL_RANKED:
-        return WIDE_SEARCH
-    return SMALL_SEARCH if agents >= MANY_AGENTS else {}
 
 
 def agent_order(sizes):
@@ -1416,6 +1407,40 @@ class FastPlanner(AgentPlanner):
         need(scores is None or np.isfinite(scores).all(), "planning: no action sequence has a "
              "finite return; the model's weights or the observation are far out of range")
         return mean, elites, scores
+
+
+# ---- How wide a student searches.
+
+
+def plans_worth(distiller, planning, rows):
+    """What the expert thinks of the student's plans: its G (Equation 2) of what the student plans
+    with these settings, around the expert's policy, in the replay's `rows` (B,): (B,)."""
+    expert, student, H = distiller.expert, distiller.student, planning.horizon
+    planner = FastPlanner(student, planning)
+    planner.reset(seed_sequence(distiller.seed).spawn(student.config.num_agents))
+    obs, _ = distiller.replay.sequences(rows, 1)
+    with one_thread():
+        z, s = student.encode(obs), expert.encode(obs)
+        policy = policy_plan(expert, s, H + 1, student.config)
+        plans = [planner.search(z[..., b:b + 1], policy[..., b])[0] for b in range(len(rows))]
+        actions = np.empty((H + 1, expert.config.dim_action, len(rows), 1), F32)
+        actions[:, agent_order(student.config)] = np.stack(plans, -1).swapaxes(0, 1).reshape(
+            actions.shape)
+        return horizon_returns(*predict(expert, s, actions), planning.discount)[H, :, 0]
+
+
+def student_search(distiller, planning, states=256):
+    """What a student plans with instead [D9], and what a wide search gains, (mean, standard error).
+
+    Far from the policy are better plans, and plans that only the student's errors promise. So it
+    searches widely if, by two standard errors, the expert thinks more of the plans it finds so in
+    held-out states. A narrow search of many agents, where samples cost most, needs fewer."""
+    rows = stream(distiller.seed, "search").choice(distiller.held_out_starts, states)
+    wide = dataclasses.replace(planning, max_std=max(planning.max_std, WIDE_SEARCH["max_std"]))
+    gains = plans_worth(distiller, wide, rows) - plans_worth(distiller, planning, rows)
+    gain, error = float(gains.mean()), float(gains.std(ddof=1) / states ** 0.5)
+    narrow = SMALL_SEARCH if distiller.student.config.num_agents >= MANY_AGENTS else {}
+    return WIDE_SEARCH if gain > 2 * error else narrow, (gain, error)
 
 
 # ==== 9. The same, in processes: workers plan for a part of the agents each ============
@@ -2408,9 +2433,9 @@ def distil_and_save(distiller, args, planning, header, out):
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
     curve, seconds, before = train_student(distiller, out, settings, planning, args.workers)
-    ranks = rank_results(distiller, 256, planning.discount)
+    ranks, gain = rank_results(distiller, 256, planning.discount), None
     if planning.prior == "policy":
-        search = student_search(ranks["rank_correlation_returns"][-1], sizes.num_agents)
+        search, gain = student_search(distiller, planning)
         planning = from_args(PlannerConfig, args, **{**asdict(planning), **search})
     save_model(out / "student.npz", student, {
         "kind": "student", **settings, "training": header.get("training", {}),
@@ -2419,8 +2444,8 @@ def distil_and_save(distiller, args, planning, header, out):
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
             "steps": config.steps, "seconds": round(seconds, 1), "seconds_total": before,
             "kl_reward": curve[-1][3], "kl_value": curve[-1][4],
-            **ranks, "max_std": planning.max_std, "samples": planning.samples,
-            "iterations": planning.iterations, "out": str(out),
+            **ranks, "wide_search_gain": gain, "max_std": planning.max_std,
+            "samples": planning.samples, "iterations": planning.iterations, "out": str(out),
             "picture": drawn(draw_curve, out / "curve.png", curve,
                              f"{args.task}, seed {args.seed}")}, planning
 
@@ -2596,10 +2621,11 @@ def make_parser():
     sub = add_command(commands, "distill", command_distill, "Distil a task's expert into a "
                       "factored student (Algorithm 1), then evaluate and time both with MPPI.",
                       epilog="Given again, a cut-off run goes on; a finished one is evaluated. "
-                      f"A student whose rank correlation of G is {WELL_RANKED} or more in held-out "
-                      f"states searches with --plan-max-std {WIDE_SEARCH['max_std']}; another of "
-                      f"{MANY_AGENTS} agents or more with --plan-samples {SMALL_SEARCH['samples']} "
-                      f"--plan-iterations {SMALL_SEARCH['iterations']}; unless told otherwise.")
+                      f"A student searches with --plan-max-std {WIDE_SEARCH['max_std']} if the "
+                      "expert values the plans that it finds so more, in held-out states; another "
+                      f"of {MANY_AGENTS} agents or more with --plan-samples "
+                      f"{SMALL_SEARCH['samples']} --plan-iterations {SMALL_SEARCH['iterations']}; "
+                      "unless told otherwise.")
     add = sub.add_argument
     add("--task", default="reacher-hard", help="one of: " + task_names())
     add("--seed", type=natural, default=0, help="of distillation [0]")

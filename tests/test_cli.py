@@ -410,18 +410,16 @@ def test_distill_prints_json_and_a_table(distilled):
     assert (result["max_std"], result["samples"]) == (fac.STUDENT_PLANNING["max_std"], 16)
 
 
-@pytest.mark.parametrize("flags, rank, expected", [
-    ([], fac.WELL_RANKED, (1.0, 32, 3)), ([], fac.WELL_RANKED - 0.01, (0.15, 32, 3)),
-    (["--plan-max-std", "0.3"], fac.WELL_RANKED, (0.3, 32, 3)),
-    (["--plan-samples", "8"], fac.WELL_RANKED, (1.0, 8, 3)),
-    (["--preset", "plain"], fac.WELL_RANKED, (2.0, 128, 4)),
-    (["--plan-prior", "none"], fac.WELL_RANKED, (2.0, 128, 4))])
-def test_who_ranks_plans_well_searches_widely(
-        tmp_path, files, monkeypatch, capsys, flags, rank, expected):
-    found = {"rank_correlation_by_step": [1.0], "rank_correlation_returns": [0.0, rank],
-             "rank_correlation_returns_training": [1.0], "rank_correlation_returns_se": None,
-             "rank_correlation_episodes": 1}
-    monkeypatch.setattr(fac, "rank_results", lambda *_: found)
+@pytest.mark.parametrize("flags, gain, expected", [
+    ([], 1.0, (1.0, 32, 3)), ([], -1.0, (0.15, 32, 3)),
+    (["--plan-max-std", "0.3"], 1.0, (0.3, 32, 3)), (["--plan-samples", "8"], 1.0, (1.0, 8, 3)),
+    (["--plan-min-std", "1.5", "--plan-max-std", "2"], 1.0, (2.0, 32, 3)),
+    (["--preset", "plain"], None, (2.0, 128, 4)),
+    (["--plan-prior", "none"], None, (2.0, 128, 4))])
+def test_who_finds_better_plans_far_away_searches_widely(
+        tmp_path, files, monkeypatch, capsys, flags, gain, expected):
+    monkeypatch.setattr(fac, "plans_worth", lambda distiller, planning, rows: np.full(
+        len(rows), gain * (planning.max_std >= 1)))
     monkeypatch.setattr(fac, "evaluate_both", lambda expert, student, *_: (
         planned.append(vars(student[1])), {})[1])
     monkeypatch.setattr(fac, "time_both", lambda *_: {})
@@ -431,15 +429,28 @@ def test_who_ranks_plans_well_searches_widely(
     own = arguments.index("--plan-samples")
     assert fac.main([*map(str, arguments[:own] + arguments[own + 4:]), *flags]) == 0
     header, _ = fac.read_npz(tmp_path / "out" / "student.npz", ("student",))
-    for found in (json.loads(capsys.readouterr().out), header["planner"], *planned):
+    result = json.loads(capsys.readouterr().out)
+    for found in (result, header["planner"], *planned):
         assert tuple(found[name] for name in ("max_std", "samples", "iterations")) == expected
     assert len(planned) == 1
+    wider = gain and float(gain * (expected[0] < 2))  # than what the flags say
+    assert result["wide_search_gain"] == (gain and [wider, 0.0])
 
 
-def test_many_agents_search_with_fewer_samples_where_they_search_narrowly():
-    for rank, agents, expected in ((0.7, 11, {}), (0.7, 12, {"samples": 16, "iterations": 2}),
-                                   (0.8, 12, {"max_std": 1.0}), (0.8, 3, {"max_std": 1.0})):
-        assert fac.student_search(rank, agents) == expected
+@pytest.mark.parametrize("agents, gain, noise, expected", [
+    (11, -1.0, 0.0, {}), (12, -1.0, 0.0, {"samples": 16, "iterations": 2}),
+    (12, 1.0, 0.0, {"max_std": 1.0}), (3, 1.0, 0.0, {"max_std": 1.0}),
+    (3, 0.1, 1.0, {}), (3, 0.2, 1.0, {"max_std": 1.0})])  # 1.6 and 3.2 standard errors
+def test_a_search_is_wide_where_its_gain_is_sure_and_small_where_many_agents_do_not(
+        monkeypatch, agents, gain, noise, expected):
+    values = noise * np.tile([-1.0, 1.0], 128)
+    monkeypatch.setattr(fac, "plans_worth", lambda distiller, planning, rows: (
+        gain + values if planning.max_std == 1 else 0 * values))
+    distiller = SimpleNamespace(seed=0, held_out_starts=np.arange(9), student=SimpleNamespace(
+        config=SimpleNamespace(num_agents=agents)))
+    search, (mean, error) = fac.student_search(distiller, fac.PlannerConfig(max_std=0.15))
+    assert search == expected
+    np.testing.assert_allclose((mean, error), (gain, noise / 16), rtol=0.01)
 
 
 def test_part_one_alone_distils_and_goes_on_from_its_end(tmp_path, files):
