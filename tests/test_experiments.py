@@ -230,7 +230,7 @@ def test_a_run_that_does_not_fit_its_figure_is_refused_before_the_work(tmp_path)
     write_rows(tmp_path / "4.csv", [("walker-run", 0, "TAP", {"steps": 3}, [{"minutes": 1.0}])])
     before = (tmp_path / "4.csv").read_bytes()
     refused(run("figure4", "--tasks", "walker-run", "--out", "4.csv", cwd=tmp_path), "4.csv: TAP",
-            "'steps': 3", "'steps': 5000", "--out")
+            "'steps': 3", "'steps': 7000", "--out")
     assert (tmp_path / "4.csv").read_bytes() == before
 
 
