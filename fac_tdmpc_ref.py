@@ -7,10 +7,10 @@ action dimension. Each joint then plans alone: cheaper, and in parallel.
     python fac_tdmpc_ref.py distill --task reacher-hard
     python fac_tdmpc_ref.py evaluate --model runs/reacher-hard-0/student.npz
 
-Part I is the method, with [D1] to [D7], to be read from top to bottom: 1 settings, 2 layers,
-3 world model, 4 distillation (Equation 4, Algorithm 1), 5 planning (Equations 2 and 3). It runs
-(`distill --plain`). Part II adds [D8] and [D9], has it faster, and the engineering. Experts learn,
-by Equation 1, in data/. The README lists the departures from the paper, [D1] to [D9].
+Part I is the method, with [D1] to [D5] and [D7], to be read from top to bottom: 1 settings,
+2 layers, 3 world model, 4 distillation (Equation 4, Algorithm 1), 5 planning (Equations 2 and 3).
+It runs (`distill --plain`). Part II adds [D8] and [D9], has it faster, and the engineering. Experts
+learn, by Equation 1, in data/ [D6]. The README lists the departures from the paper, [D1] to [D9].
 
 The one idea that keeps it small: every model carries an agent axis N, and a centralized model is
 the case N = 1. There is one world model, one planner, one loss. The axes, everywhere:
