@@ -1409,24 +1409,26 @@ class FastPlanner(AgentPlanner):
         return mean, elites, scores
 
 
-# ---- How wide a student searches.
+# ---- What plans are worth, and how wide a student searches.
 
 
-def plans_worth(distiller, planning, rows):
-    """What the expert thinks of the student's plans: its G (Equation 2) of what the student plans
-    with these settings, around the expert's policy, in the replay's `rows` (B,): (B,)."""
-    expert, student, H = distiller.expert, distiller.student, planning.horizon
-    planner = FastPlanner(student, planning)
-    planner.reset(seed_sequence(distiller.seed).spawn(student.config.num_agents))
-    obs, _ = distiller.replay.sequences(rows, 1)
+def plan_gains(expert, model, config, obs, seed=0):
+    """What plans of the expert or a student, `model`, are worth above what the expert's policy
+    would do, in states obs (O, B): by the expert's own G, and by the model's (what they promise),
+    two (B,)."""
     with one_thread():
-        z, s = student.encode(obs), expert.encode(obs)
-        policy = policy_plan(expert, s, H + 1, student.config)
-        plans = [planner.search(z[..., b:b + 1], policy[..., b])[0] for b in range(len(rows))]
-        actions = np.empty((H + 1, expert.config.dim_action, len(rows), 1), F32)
-        actions[:, agent_order(student.config)] = np.stack(plans, -1).swapaxes(0, 1).reshape(
-            actions.shape)
-        return horizon_returns(*predict(expert, s, actions), planning.discount)[H, :, 0]
+        s, z, planner = expert.encode(obs), model.encode(obs), FastPlanner(model, config)
+        policy, plans = policy_plan(expert, s, config.horizon + 1, model.config), []
+        first = policy * F32(config.prior == "policy")
+        for b, seeds in enumerate(seed_sequence(seed).spawn(obs.shape[1])):
+            planner.reset(seeds.spawn(len(z)))
+            plans.append(planner.search(z[..., b:b + 1], first[..., b])[0])
+        both = np.stack([np.stack(plans, -1), policy], -1).swapaxes(0, 1)  # (L, N, d, B, 2)
+        both = both.reshape(len(both), -1, *both.shape[3:])
+        robot = np.argsort(np.arange(both.shape[1])[agent_order(model.config)])
+        G = [horizon_returns(*predict(*of), config.discount)[-1]
+             for of in ((expert, s, both[:, robot]), (model, z, both))]
+    return [g[:, 0] - g[:, 1] for g in G]
 
 
 def student_search(distiller, planning, states=256):
@@ -1436,8 +1438,10 @@ def student_search(distiller, planning, states=256):
     searches widely if, by two standard errors, the expert thinks more of the plans it finds so in
     held-out states. A narrow search of many agents, where samples cost most, needs fewer."""
     rows = stream(distiller.seed, "search").choice(distiller.held_out_starts, states)
+    obs, _ = distiller.replay.sequences(rows, 1)
     wide = dataclasses.replace(planning, max_std=max(planning.max_std, WIDE_SEARCH["max_std"]))
-    gains = plans_worth(distiller, wide, rows) - plans_worth(distiller, planning, rows)
+    gains = np.subtract(*(plan_gains(distiller.expert, distiller.student, config, obs)[0]
+                          for config in (wide, planning)))
     gain, error = float(gains.mean()), float(gains.std(ddof=1) / states ** 0.5)
     narrow = SMALL_SEARCH if distiller.student.config.num_agents >= MANY_AGENTS else {}
     return WIDE_SEARCH if gain > 2 * error else narrow, (gain, error)

@@ -261,25 +261,6 @@ def command_figure9(args):
     return result
 
 
-def plan_gains(expert, model, config, obs, seed=0):
-    """What plans of the expert or a student, `model`, are worth above what the expert's policy
-    would do, in states obs (O, S): by the expert's own G, and by the model's (what they promise),
-    two (S,)."""
-    with fac.one_thread():
-        z, own, planner = expert.encode(obs), model.encode(obs), fac.FastPlanner(model, config)
-        policy, plans = fac.policy_plan(expert, z, config.horizon + 1, model.config), []
-        first = policy * fac.F32(config.prior == "policy")
-        for i, seeds in enumerate(fac.seed_sequence(seed).spawn(obs.shape[1])):
-            planner.reset(seeds.spawn(len(own)))
-            plans.append(planner.search(own[:, :, i:i + 1], first[..., i])[0])
-        both = np.stack([np.stack(plans, -1), policy], -1).swapaxes(0, 1)  # (L, N, d, S, 2)
-        both = both.reshape(len(both), -1, *both.shape[3:])
-        robot = np.argsort(np.arange(both.shape[1])[fac.agent_order(model.config)])
-        G = [fac.horizon_returns(*fac.predict(*of), config.discount)[-1]
-             for of in ((expert, z, both[:, robot]), (model, own, both))]
-    return [g[:, 0] - g[:, 1] for g in G]
-
-
 NOISE = fac.DistillConfig.noise_std  # around what is done, for the additive ceiling
 
 
@@ -344,7 +325,7 @@ def command_agreement(args):
     with fac.one_thread():
         ceiling, explained = additive_ceiling(expert, obs[:, :24], actions[..., :24], NOISE,
                                               config.discount, rng).mean(-1).tolist()
-    gain, promise = (x.mean().item() for x in plan_gains(expert, student, config, obs)
+    gain, promise = (x.mean().item() for x in fac.plan_gains(expert, student, config, obs)
                      ) if expert.has_policy else (None, None)
     played, done, rewards, _ = fac.play(student, task, config,
                                         fac.episode_seeds(args.seed, args.episodes))
@@ -368,7 +349,7 @@ def command_agreement(args):
     fac.print_table([("joint", *map(str, range(len(own)))), *(
         (name, *(f"{x:.2f}" for x in result[key]))
         for name, key in (("held-out states", "held_out"), ("worst episode", "worst_episode")))])
-    print(f"no sum over action dimensions can rank the expert's G better than "
+    print(f"a sum over action dimensions, fitted, ranks the expert's G at "
           f"{', '.join(f'{x:.2f}' for x in ceiling)} (H = 0, 1, ...; noise of {NOISE})")
     if expert.has_policy:
         print(f"a plan promises {promise:.2f} above the expert's policy, by the student's G; by "

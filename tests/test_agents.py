@@ -129,37 +129,12 @@ def test_what_is_told_of_joints_is_told_in_the_robot_s_order(tmp_path):
     theirs = look.agreement(plain, permuted(expert), obs, actions[ORDER], Values(ORDER))
     assert np.allclose(ours[ORDER], theirs, atol=0.02)
     config = fac.PlannerConfig(samples=8, iterations=1)
-    gains = (look.plan_gains(expert, grouped, config, obs),
-             look.plan_gains(permuted(expert), plain, config, obs))
+    gains = (fac.plan_gains(expert, grouped, config, obs),
+             fac.plan_gains(permuted(expert), plain, config, obs))
     assert np.allclose(*gains, atol=1e-3)
     episode = rng.standard_normal((9, 8)).astype(np.float32), rng.uniform(-1, 1, (9, 4))
     assert np.allclose(look.credit(grouped, *episode, config),
                        look.credit(plain, episode[0], episode[1][:, ORDER], config))
-
-
-def test_plans_are_worth_what_the_expert_returns_for_them(tmp_path):
-    """In each state: a plan of the student's from there, in the robot's order, by Equation 2."""
-    replay = replay_of(tmp_path / "replay.npz", slice(None))
-    expert = random_model(n=1, dim_action=4, policy=True)
-    config = fac.DistillConfig(steps=1, expert_episodes=0, targets="joint")
-    planning = fac.PlannerConfig(samples=8, iterations=2, prior="policy", max_std=0.5,
-                                 returns="plain", horizon=2)
-    with contextlib.closing(fac.Distiller(expert, replay, config, GROUPS)) as distiller:
-        student, rows = distiller.student, distiller.held_out_starts[:3]
-        found = fac.plans_worth(distiller, planning, rows)
-        policy = fac.plans_worth(distiller, dataclasses.replace(planning, iterations=0), rows)
-    planner = fac.AgentPlanner(student, planning)
-    planner.reset(np.random.SeedSequence(0).spawn(2))
-    for row, worth, before in zip(rows, found, policy):
-        obs = replay.observation[row][:, None].astype(fac.F32)
-        s = expert.encode(obs)
-        rollout = fac.policy_rollout(expert, s, [fac.F32(0)] * 3)[:, 0]  # (L, A, 1)
-        first = rollout[:, ORDER].reshape(3, 2, 2).swapaxes(0, 1)
-        plan = planner.search(student.encode(obs), first)[0]
-        robot = plan.swapaxes(0, 1).reshape(1, 3, 4, 1)[:, :, BACK]
-        for actions, expected in ((robot, worth), (rollout[None], before)):
-            G = fac.h_step_return(expert, s, actions, planning)[0, 0]
-            np.testing.assert_allclose(expected, G, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("groups, num_agents", [

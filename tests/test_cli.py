@@ -418,8 +418,8 @@ def test_distill_prints_json_and_a_table(distilled):
     (["--plan-prior", "none"], None, (2.0, 128, 4))])
 def test_who_finds_better_plans_far_away_searches_widely(
         tmp_path, files, monkeypatch, capsys, flags, gain, expected):
-    monkeypatch.setattr(fac, "plans_worth", lambda distiller, planning, rows: np.full(
-        len(rows), gain * (planning.max_std >= 1)))
+    monkeypatch.setattr(fac, "plan_gains", lambda expert, student, planning, obs: [np.full(
+        obs.shape[1], gain * (planning.max_std >= 1))])
     monkeypatch.setattr(fac, "evaluate_both", lambda expert, student, *_: (
         planned.append(vars(student[1])), {})[1])
     monkeypatch.setattr(fac, "time_both", lambda *_: {})
@@ -442,12 +442,13 @@ def test_who_finds_better_plans_far_away_searches_widely(
     (12, 1.0, 0.0, {"max_std": 1.0}), (3, 1.0, 0.0, {"max_std": 1.0}),
     (3, 0.1, 1.0, {}), (3, 0.2, 1.0, {"max_std": 1.0})])  # 1.6 and 3.2 standard errors
 def test_a_search_is_wide_where_its_gain_is_sure_and_small_where_many_agents_do_not(
-        monkeypatch, agents, gain, noise, expected):
+        files, monkeypatch, agents, gain, noise, expected):
     values = noise * np.tile([-1.0, 1.0], 128)
-    monkeypatch.setattr(fac, "plans_worth", lambda distiller, planning, rows: (
-        gain + values if planning.max_std == 1 else 0 * values))
-    distiller = SimpleNamespace(seed=0, held_out_starts=np.arange(9), student=SimpleNamespace(
-        config=SimpleNamespace(num_agents=agents)))
+    monkeypatch.setattr(fac, "plan_gains", lambda expert, student, planning, obs: [
+        gain + values if planning.max_std == 1 else 0 * values])
+    distiller = SimpleNamespace(
+        seed=0, expert=None, held_out_starts=np.arange(9), replay=fac.Replay(files / "replay.npz"),
+        student=SimpleNamespace(config=SimpleNamespace(num_agents=agents)))
     search, (mean, error) = fac.student_search(distiller, fac.PlannerConfig(max_std=0.15))
     assert search == expected
     np.testing.assert_allclose((mean, error), (gain, noise / 16), rtol=0.01)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import fac_tdmpc_ref as fac
-import look
 from test_planning import random_model
 
 CONFIG = fac.DistillConfig(steps=300, batch_size=16, warmup=20, lr=3e-3, horizon=3,
@@ -387,23 +386,23 @@ def test_what_plans_gain_is_told_by_the_expert_and_promised_by_the_model(replay)
     obs = replay.observation[:16].T.astype(np.float32)
     with fresh(replay, CONFIG) as distiller:
         expert, student = distiller.expert, distiller.student
-    gain, promise = look.plan_gains(expert, expert, config, obs)
+    gain, promise = fac.plan_gains(expert, expert, config, obs)
     assert gain.shape == (16,) and np.array_equal(gain, promise)  # its own G is the expert's
     assert gain.mean() > 0 and (gain > 0).mean() > 0.8
     still = fac.dataclasses.replace(config, iterations=0)
-    assert not np.any(look.plan_gains(expert, expert, still, obs))
+    assert not np.any(fac.plan_gains(expert, expert, still, obs))
     rng, z = np.random.default_rng(0), expert.encode(obs)
     for key, value in student.params.items():  # one that knows nothing
         if not key.startswith("_expert"):
             value[:] = 0.3 * rng.standard_normal(value.shape)
-    lost, promised = look.plan_gains(expert, student, config, obs)
+    lost, promised = fac.plan_gains(expert, student, config, obs)
     assert promised.mean() > 0 and lost.mean() < gain.mean() / 2
-    assert not np.array_equal(lost, look.plan_gains(expert, student, config, obs, 1)[0])
+    assert not np.array_equal(lost, fac.plan_gains(expert, student, config, obs, 1)[0])
     still = fac.dataclasses.replace(still, prior="none")  # whose plan is to do nothing
     policy = fac.policy_rollout(expert, z, [np.float32(0)] * 4)[:, 0]
     both = np.stack([np.zeros_like(policy), policy], -1)
     G = fac.horizon_returns(*fac.predict(expert, z, both), config.discount)[-1]
-    np.testing.assert_allclose(look.plan_gains(expert, student, still, obs)[0], G[:, 0] - G[:, 1],
+    np.testing.assert_allclose(fac.plan_gains(expert, student, still, obs)[0], G[:, 0] - G[:, 1],
                                rtol=1e-4, atol=1e-5)
 
 
