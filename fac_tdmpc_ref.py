@@ -1289,9 +1289,7 @@ def rank_results(distiller, states, discount):
 def homogeneous(params, layer):
     """A layer as one matrix on inputs whose last row is 1: [[W, b], [0, 1]], (N, out+1, in+1)."""
     W, b = params[f"{layer}.weight"], params[f"{layer}.bias"]
-    last = np.zeros((len(W), 1, W.shape[2] + 1), W.dtype)
-    last[..., -1] = 1
-    return np.concatenate([np.concatenate([W, b], 2), last], 1)
+    return np.block([[W, b], [np.zeros_like(W[:, :1]), np.ones_like(b[:, :1])]])
 
 
 def side_by_side(params, names, i):
