@@ -2246,9 +2246,8 @@ def same_settings(found, expected, where, group=""):
 def write_curve(path, columns, rows):
     """A learning curve as CSV."""
     with atomic_file(path, "w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in row] for row in rows)
+        csv.writer(file).writerows([f"{v:.6g}" if isinstance(v, float) else v for v in row]
+                                   for row in (columns, *rows))
 
 
 def write_json(path, found):
