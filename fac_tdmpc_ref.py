@@ -1196,22 +1196,20 @@ class PlainDistiller(Distiller):
         need(not isinstance(num_agents, str), "--plain cuts actions in their order; pass "
              "--num-agents for --agents")
         super().__init__(expert, replay, config, num_agents, seed)
+        self._plain = distill(expert, replay, config, self.student.config.num_agents, seed)
 
     def load(self, state):
         """A state of the end; one that was cut off starts anew."""
         if state["step"] == self.config.steps:
             super().load(state)
 
-    def run(self):
-        """Yields each step's losses, as Distiller.run does."""
-        steps = () if self.t else distill(self.expert, self.replay, self.config,
-                                          self.student.config.num_agents, self.seed)
-        for student, losses in steps:
-            for key, value in self.optimizer.params.items():
-                value[:] = student.params[key]
-            self.optimizer.t += 1
-            check_finite({"loss is": losses}, self.t, self.config.lr)
-            yield losses
+    def step(self):
+        """The loop's next, whose student is kept."""
+        student, losses = next(self._plain)
+        for key, value in self.optimizer.params.items():
+            value[:] = student.params[key]
+        self.optimizer.t += 1
+        return losses
 
 
 # ---- How alike student and expert rank actions.
