@@ -1177,9 +1177,11 @@ class Distiller:
         played = state["played"].reshape(-1, self.played.shape[1])  # or it is another robot's
         self.played, self.lengths, self._number = played, state["lengths"], None
 
-    def ranks(self, states, discount):
-        """`rank_correlation`, which the learning curve shows."""
-        return rank_correlation(self, states, discount)
+    def ranks(self, states, discount=0.99):
+        """The means of `rank_by_state` over so many held-out states, drawn evenly: two (L,)."""
+        rng = stream(self.seed, "rank correlation")
+        rows = rng.choice(self.held_out_starts, states)
+        return tuple(ranks.mean(-1) for ranks in rank_by_state(self, rows, discount, rng))
 
     def close(self):
         """Stop the threads."""
@@ -1249,13 +1251,6 @@ def rank_by_state(distiller, rows, discount, rng):
             spearman(*(horizon_returns(*out, discount) for out in (expert, found))))
 
 
-def rank_correlation(distiller, states, discount=0.99):
-    """The means of `rank_by_state` over so many held-out states, drawn evenly: two (L,)."""
-    rng = stream(distiller.seed, "rank correlation")
-    rows = rng.choice(distiller.held_out_starts, states)
-    return tuple(ranks.mean(-1) for ranks in rank_by_state(distiller, rows, discount, rng))
-
-
 def standard_error(values, groups):
     """Of the mean of values (L, B), of which those of one group (B,) are alike, as states of one
     episode are: a list of L; None where all are of one group."""
@@ -1266,7 +1261,7 @@ def standard_error(values, groups):
 
 
 def rank_results(distiller, states, discount):
-    """`rank_correlation` for result.json, the return's also in states that were learned from."""
+    """Distiller.ranks for result.json, the return's also in states that were learned from."""
     rng = stream(distiller.seed, "rank correlation")
     rows = rng.choice(distiller.held_out_starts, states)
     q, g = rank_by_state(distiller, rows, discount, rng)

@@ -287,7 +287,7 @@ def distil(task, seed, case, settings):
                 continue
             row = measure(student, task, planning, own["episodes"], environment)
             if not environment:  # others' ranks are of the robot's actions
-                q, g = fac.rank_correlation(distiller, 256, planning.discount)
+                q, g = distiller.ranks(256, planning.discount)
                 row.update(rank_q=float(q[0]), rank_return=float(g[-1]))
             yield {"step": distiller.t, **row}
 

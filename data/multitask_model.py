@@ -206,8 +206,7 @@ class MultitaskDistiller(fac.Distiller):
             teacher.student = self.student.of_task(task)
 
     def ranks(self, states, discount):
-        """`rank_correlation`'s means over the tasks, which share the states."""
+        """Distiller.ranks' means over the tasks, which share the states."""
         self.refresh()
         each = -(-states // len(self.teachers))
-        return np.mean([fac.rank_correlation(teacher, each, discount)
-                        for teacher in self.teachers.values()], 0)
+        return np.mean([teacher.ranks(each, discount) for teacher in self.teachers.values()], 0)

@@ -59,7 +59,7 @@ def learned(distiller, episodes, noise, monkeypatch):
         distiller.add(*episodes)
         drawn = distiller.draw(0, 0, 32)
         losses = [distiller.step() for _ in range(10)]
-        return drawn, losses, fac.rank_correlation(distiller, 16)
+        return drawn, losses, distiller.ranks(16)
 
 
 def test_a_grouping_learns_and_plans_as_the_plain_cut_of_a_permuted_robot(tmp_path, monkeypatch):

@@ -52,7 +52,7 @@ def test_a_student_is_no_expert(replay):
 
 def rank(distiller):
     """Of Q at each h."""
-    return fac.rank_correlation(distiller, 64)[0]
+    return distiller.ranks(64)[0]
 
 
 @pytest.mark.parametrize("settings", [{}, {"encoder_input": "observation", "kl": "reverse"}])
@@ -78,14 +78,14 @@ def test_the_student_learns_the_experts_order(replay, settings):
 def test_rank_correlation_of_the_expert_with_itself_is_one(replay):
     distiller, _ = distilled(replay, CONFIG, 0)
     distiller.student = distiller.expert  # reads observations, as N = 1 does
-    for of_q_or_return in fac.rank_correlation(distiller, 64):
+    for of_q_or_return in distiller.ranks(64):
         assert of_q_or_return.shape == (4,) and np.allclose(of_q_or_return, 1, atol=1e-6)
 
 
 def test_the_ranks_of_a_result_say_in_which_states_and_of_how_many_episodes(replay, monkeypatch):
     distiller, _ = distilled(replay, CONFIG, 0)
     found = fac.rank_results(distiller, 64, 0.99)
-    q, g = fac.rank_correlation(distiller, 64)
+    q, g = distiller.ranks(64)
     assert found["rank_correlation_by_step"] == q.tolist()
     assert found["rank_correlation_returns"] == g.tolist()
     assert found["rank_correlation"] == q[0] and found["rank_correlation_episodes"] == 2
@@ -130,10 +130,10 @@ def test_rank_correlations_are_over_32_sequences_discounted_as_planned(replay, m
         return features, actions, predictions
 
     monkeypatch.setattr(distiller, "perturb", watched)
-    _, of_rewards, *_ = fac.rank_correlation(distiller, 16, 0.0)
+    _, of_rewards, *_ = distiller.ranks(16, 0.0)
     assert set(copies) == {32}
     assert (of_rewards[1:] == of_rewards[1]).all() and of_rewards[0] != of_rewards[1]
-    _, of_returns, *_ = fac.rank_correlation(distiller, 16, 0.9)
+    _, of_returns, *_ = distiller.ranks(16, 0.9)
     assert len(set(of_returns)) == 4 and of_returns[0] == of_rewards[0]  # Q alone
 
 
@@ -276,7 +276,7 @@ def test_the_expert_s_policy_plays_first_with_noise_and_once(replay, tmp_path, m
         return played(*range(len(seeds)))
 
     monkeypatch.setattr(fac, "play", play)
-    monkeypatch.setattr(fac, "rank_correlation", lambda *_: (np.zeros(4), np.zeros(4)))
+    monkeypatch.setattr(fac.Distiller, "ranks", lambda *_: (np.zeros(4), np.zeros(4)))
     config = fac.dataclasses.replace(CONFIG, steps=8, batch_size=4, expert_episodes=3)
     for _ in range(2):
         with fresh(replay, config) as distiller:
@@ -550,7 +550,7 @@ def test_odd_settings_learn_all_the_same(replay, odd, n):
     config = fac.dataclasses.replace(CONFIG, **{"batch_size": 4, "steps": 3, **odd})
     distiller, losses = distilled(replay, config, config.steps, n)
     assert losses.shape == (config.steps, 3) and np.isfinite(losses).all() and (losses >= 0).all()
-    assert np.isfinite(fac.rank_correlation(distiller, 8)).all()
+    assert np.isfinite(distiller.ranks(8)).all()
 
 
 @pytest.mark.parametrize("encoder_input", ["latent", "observation"])

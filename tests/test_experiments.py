@@ -390,7 +390,7 @@ def test_a_run_is_distilled_as_it_says(monkeypatch):
         return [np.zeros((len(seeds), fac.EPISODE_STEPS, *shape)) for shape in ((17,), (6,), ())]
 
     monkeypatch.setattr(fac, "play", play)
-    monkeypatch.setattr(fac, "rank_correlation", lambda *_: (np.arange(3), np.arange(4, 7)))
+    monkeypatch.setattr(fac.Distiller, "ranks", lambda *_: (np.arange(3), np.arange(4, 7)))
     monkeypatch.setattr(experiments, "distiller_of", lambda case: lambda *args: (
         made.append(args[3:]), fac.Distiller(*args))[1])
     (row,) = experiments.distil("cheetah-run", 5, "x", {
