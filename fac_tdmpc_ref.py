@@ -1654,6 +1654,8 @@ TASKS = {
     "cheetah-run": (17, 6), "walker-walk": (24, 6), "walker-run": (24, 6),
     "quadruped-walk": (78, 12), "quadruped-run": (78, 12),
     "humanoid-stand": (67, 21), "humanoid-walk": (67, 21)}
+TASK_NAMES = (f"{', '.join(TASKS)}, another DOMAIN-TASK of dm_control's suite, "
+              "or gym:ID of Gymnasium")
 REACHER_TARGET = {"easy": 0.05, "hard": 0.015}  # radius of the target, metres
 REACHER = DATA / "reacher.xml"  # three links; dm_control's has two
 
@@ -1790,11 +1792,6 @@ def robot_steps(robot, config):
     return int(T)
 
 
-def task_names():
-    """What a task may be, for --help and errors."""
-    return f"{', '.join(TASKS)}, another DOMAIN-TASK of dm_control's suite, or gym:ID of Gymnasium"
-
-
 def lookup_task(task):
     """(domain, name, dim O, dim A) of a task; UserError with the nearest name otherwise."""
     task = str(task)
@@ -1817,8 +1814,8 @@ def suite_sizes(task):
     suite, *_ = import_dm_control()
     known = {"-".join(names): names for names in suite.ALL_TASKS}
     near = difflib.get_close_matches(task, [*TASKS, *known], n=1, cutoff=0)
-    need(task in known, f"unknown task {task!r}; did you mean {near[0]!r}? Known tasks: "
-         f"{task_names()}")
+    need(task in known,
+         f"unknown task {task!r}; did you mean {near[0]!r}? Known tasks: {TASK_NAMES}")
     try:
         env = suite.load(*known[task])
         env.reset()
@@ -2621,7 +2618,7 @@ def make_parser():
                       f"{SMALL_SEARCH['samples']} --plan-iterations {SMALL_SEARCH['iterations']}; "
                       "unless told otherwise.")
     add = sub.add_argument
-    add("--task", default="reacher-hard", help="one of: " + task_names())
+    add("--task", default="reacher-hard", help="one of: " + TASK_NAMES)
     add("--seed", type=natural, default=0, help="of distillation [0]")
     agents = sub.add_mutually_exclusive_group().add_argument
     agents("--num-agents", type=int, help="N, a divisor of dim(A) [dim(A)]")
@@ -2650,7 +2647,7 @@ def make_parser():
                       "student) through whole episodes.")
     add = sub.add_argument
     add("--model", required=True, help="an expert.npz or student.npz")
-    add("--task", help="one of: " + task_names() + " [the model's own]")
+    add("--task", help="one of: " + TASK_NAMES + " [the model's own]")
     add("--seed", type=natural, default=0, help="of the episodes [0]")
     add("--record", action="store_true", help="keep them in a .json beside the model, for distill")
     add("--episodes", type=positive, default=20, help="[20]")

@@ -617,7 +617,7 @@ def main(argv=None):
     """Run the command line; returns the exit status."""
     parser = fac.Parser(prog="import_expert.py", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("file", metavar="FILE", help="checkpoint: " + ", ".join(CHECKPOINTS))
-    parser.add_argument("--task", required=True, help="one of: " + fac.task_names())
+    parser.add_argument("--task", required=True, help="one of: " + fac.TASK_NAMES)
     parser.add_argument("--out", required=True, help="folder for expert.npz and replay.npz")
     parser.add_argument("--action-repeat", type=fac.natural, metavar="N",
                         help=f"control steps of its decisions [{fac.ACTION_REPEAT}; gym:ID 1]")

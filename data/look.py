@@ -377,7 +377,7 @@ def add_commands(commands):
         "scale); below, a decision's time.")
     sub.add_argument("--model", required=True, help="an expert.npz or student.npz")
     sub.add_argument("--beside", help="another one, on the same episode")
-    sub.add_argument("--task", help="one of: " + fac.task_names() + " [the model's own]")
+    sub.add_argument("--task", help="one of: " + fac.TASK_NAMES + " [the model's own]")
     sub.add_argument("--seed", type=fac.natural, default=0, help="of the evaluation [0]")
     sub.add_argument("--episode", type=fac.natural, default=0, help="of that evaluation [0]")
     sub.add_argument("--decisions", type=positive, default=150, help="[150]")
@@ -391,7 +391,7 @@ def add_commands(commands):
              "student's worst episode.", 20)):
         sub = fac.add_command(commands, name, run, help)
         sub.add_argument("--model", required=True, help="a student.npz")
-        sub.add_argument("--task", help="one of: " + fac.task_names() + " [the model's own]")
+        sub.add_argument("--task", help="one of: " + fac.TASK_NAMES + " [the model's own]")
         sub.add_argument("--seed", type=fac.natural, default=0, help="of the episodes [0]")
         sub.add_argument("--episodes", type=positive, default=episodes, help="[%(default)s]")
         sub.add_argument("--out", default=f"{name}.png", help="the picture [%(default)s]")

@@ -344,7 +344,7 @@ def make_parser():
         sub = fac.add_command(commands, name, run, help, **about)
         if tasks:
             sub.add_argument("--tasks", nargs="+", default=[], metavar="TASK", help="any of: "
-                             f"{fac.task_names()} [{tasks}]")
+                             f"{fac.TASK_NAMES} [{tasks}]")
             sub.add_argument("--workers", type=fac.natural,
                              help="processes that play episodes; 0: this one [cores]")
         if model:

@@ -703,7 +703,7 @@ def make_parser():
         "the same command is given again. Its folder is what distill takes as --expert.")
     add, natural = parser.add_argument, fac.natural
     positive = functools.partial(natural, least=1)
-    add("--task", default="reacher-easy", help="one of: " + fac.task_names())
+    add("--task", default="reacher-easy", help="one of: " + fac.TASK_NAMES)
     add("--steps", type=natural, help="decisions in all; a run that is over goes on with more "
         "[30000, or what makes whole rounds]")
     add("--seed", type=natural, default=0, help="[0]")

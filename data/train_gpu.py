@@ -444,7 +444,7 @@ def make_parser():
     add, natural = parser.add_argument, fac.natural
     positive = functools.partial(natural, least=1)
     add("--tasks", nargs="+", default=list(fac.TASKS), metavar="TASK", help="of: " +
-        fac.task_names() + "; one may be named twice [all]")
+        fac.TASK_NAMES + "; one may be named twice [all]")
     add("--minutes", type=float, default=9, help="how long to learn [9]")
     add("--seed", type=natural, default=0, help="[0]")
     add("--envs", type=positive, default=16, help="processes, and episodes of a task at once [16]")
