@@ -906,11 +906,11 @@ def agent_order(sizes):
     return [*map(int, sizes.groups.replace("/", ",").split(","))] if sizes.groups else slice(None)
 
 
-def policy_plan(expert, z, steps, sizes):
-    """What an expert's policy would do from z (1, m, B) on, rolled out in its model: the part of
+def policy_plan(expert, obs, steps, sizes):
+    """What an expert's policy would do from obs (O, B) on, rolled out in its model: the part of
     each agent of a ModelConfig, (N, L, d, B)."""
-    actions = policy_rollout(expert, z, [F32(0)] * steps)[:, 0, agent_order(sizes)]
-    return actions.reshape(steps, sizes.num_agents, -1, z.shape[2]).swapaxes(0, 1)
+    actions = policy_rollout(expert, expert.encode(obs), [F32(0)] * steps)[:, 0, agent_order(sizes)]
+    return actions.reshape(steps, sizes.num_agents, -1, obs.shape[1]).swapaxes(0, 1)
 
 
 def around_policy(expert, obs, actions, share, rng):
@@ -918,8 +918,8 @@ def around_policy(expert, obs, actions, share, rng):
     policy would do, rolled out in its model, for the others the given ones [D8]."""
     chosen = rng.random(obs.shape[1]) < share
     if chosen.any():
-        z, actions = expert.encode(obs[:, chosen]), actions.copy()
-        actions[:, :, chosen] = policy_plan(expert, z, len(actions), expert.config)[0]
+        actions = actions.copy()
+        actions[:, :, chosen] = policy_plan(expert, obs[:, chosen], len(actions), expert.config)[0]
     return actions
 
 
@@ -1409,7 +1409,7 @@ def plan_gains(expert, model, config, obs, seed=0):
     two (B,)."""
     with one_thread():
         s, z, planner = expert.encode(obs), model.encode(obs), FastPlanner(model, config)
-        policy, plans = policy_plan(expert, s, config.horizon + 1, model.config), []
+        policy, plans = policy_plan(expert, obs, config.horizon + 1, model.config), []
         first = policy * F32(config.prior == "policy")
         for b, seeds in enumerate(seed_sequence(seed).spawn(obs.shape[1])):
             planner.reset(seeds.spawn(len(z)))
@@ -1524,9 +1524,12 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
 
     def act(self, obs):
         """obs (O,) -> action (A,), float32 in [-1, 1]. UserError: other shape, NaN, no finite G."""
-        obs = observed(obs, self.model.config)
+        obs, prior = observed(obs, self.model.config)[:, None], None
         with one_thread():
-            z, prior = self.model.encode(obs[:, None]), self._prior(obs)
+            z = self.model.encode(obs)
+            if self.config.prior == "policy":
+                prior = policy_plan(self._teacher, obs, self.config.horizon + 1,
+                                    self.model.config)[..., 0]
             tasks = [(z[part], prior if prior is None else prior[part]) for part in self._parts]
             try:
                 self._workers.send_all(tasks[1:])
@@ -1537,13 +1540,6 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
         action = np.empty(self.model.config.dim_action, F32)
         action[agent_order(self.model.config)] = np.concatenate(plans).reshape(-1)
         return action
-
-    def _prior(self, obs):
-        """The expert's policy from obs (O,) on, rolled out in its model: (N, L, d), or None."""
-        if self.config.prior == "none":
-            return None
-        return policy_plan(self._teacher, self._teacher.encode(obs[:, None]),
-                           self.config.horizon + 1, self.model.config)[..., 0]
 
 
 def _planning_worker(connection):
