@@ -2354,9 +2354,8 @@ def command_distill(args):
     own = PlannerConfig(**theirs)  # the expert's
     around = getattr(args, "PlannerConfig.prior") != "none"
     planning = from_args(PlannerConfig, args, **{
-        **theirs, **(student_planning(config) if around else {}),
+        **theirs, **(student_planning(config) if around else {}), "horizon": config.horizon,
         **({"returns": "plain"} if args.plain else {})})
-    planning = dataclasses.replace(planning, horizon=config.horizon)
     distiller_class = PlainDistiller if args.plain else Distiller
     out = Path(args.out or f"runs/{args.task}-{args.seed}")
     record = recorded_returns(path, expert, own, args.eval_seed)
