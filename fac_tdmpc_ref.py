@@ -2371,7 +2371,7 @@ def command_distill(args):
         result.update(time_both(*both, obs))
         result["seconds_total"] = round(result["seconds_total"] + time.time() - began, 1)
         write_json(out / "result.json", result)
-    report(result, (own, planning), args.eval_seed)
+    report(result, (own, planning))
     return result
 
 
@@ -2475,7 +2475,7 @@ def time_both(expert, student, obs):
             "speedup": central / best, "plan_workers": beside if best < alone else 0}
 
 
-def report(result, plannings, eval_seed):
+def report(result, plannings):
     """Print distill's table. plannings: the expert's and the student's."""
     expert, student = (f"{result[f'{kind}_return_mean']:.0f} ± {result[f'{kind}_return_std']:.0f}"
                        for kind in ("expert", "student"))
@@ -2490,8 +2490,8 @@ def report(result, plannings, eval_seed):
              result["plan_ms_student_in_process"]),
             (f"student, workers beside: {result['plan_workers']}", "", "the same plans",
              result["plan_ms_student"])][:3 if result["plan_workers"] else 2]
-    print(f"\n{result['task']}, {result['episodes']} episodes, evaluation seed {eval_seed}, "
-          f"horizon {' and '.join(map(str, dict.fromkeys(horizons)))}\n")
+    print(f"\n{result['task']}, {result['episodes']} episodes, evaluation seed "
+          f"{result['eval_seed']}, horizon {' and '.join(map(str, dict.fromkeys(horizons)))}\n")
     table = [(name, budget, returns, f"{ms:.1f}", f"{rows[0][3] / ms:.1f}")
              for name, budget, returns, ms in rows]
     if policy := result["policy_returns"]:
