@@ -2422,7 +2422,9 @@ def distil_and_save(distiller, args, planning, header, out):
     ranks, gain = rank_results(distiller, 256, planning.discount), None
     if planning.prior == "policy":
         search, gain = student_search(distiller, planning)
-        planning = from_args(PlannerConfig, args, **{**asdict(planning), **search})
+        samples = max(search.get("samples", planning.samples), planning.elites)  # a flag's elites
+        planning = from_args(PlannerConfig, args, **{
+            **asdict(planning), **search, "samples": samples})
     save_model(out / "student.npz", student, {
         "kind": "student", **settings, "training": header.get("training", {}),
         "planner": {name: getattr(planning, name) for name in STUDENT_PLANNING}})

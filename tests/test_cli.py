@@ -415,7 +415,9 @@ def test_distill_prints_json_and_a_table(distilled):
     (["--plan-max-std", "0.3"], 1.0, (0.3, 32, 3)), (["--plan-samples", "8"], 1.0, (1.0, 8, 3)),
     (["--plan-min-std", "1.5", "--plan-max-std", "2"], 1.0, (2.0, 32, 3)),
     (["--preset", "plain"], None, (2.0, 128, 4)),
-    (["--plan-prior", "none"], None, (2.0, 128, 4))])
+    (["--plan-prior", "none"], None, (2.0, 128, 4)),
+    (["--plan-elites", "20"], -1.0, (0.15, 20, 2)),  # of many agents, which search with 16 samples
+    (["--plan-elites", "20", "--plan-samples", "24"], -1.0, (0.15, 24, 2))])
 def test_who_finds_better_plans_far_away_searches_widely(
         tmp_path, files, monkeypatch, capsys, flags, gain, expected):
     monkeypatch.setattr(fac, "plan_gains", lambda expert, student, planning, obs: [np.full(
@@ -424,6 +426,8 @@ def test_who_finds_better_plans_far_away_searches_widely(
         planned.append(vars(student[1])), {})[1])
     monkeypatch.setattr(fac, "time_both", lambda *_: {})
     monkeypatch.setattr(fac, "report", lambda *_: None)
+    if "--plan-elites" in flags:
+        monkeypatch.setattr(fac, "MANY_AGENTS", 3)  # as the reacher's
     planned = []
     arguments = distill_arguments(files, "--workers", "0", "--json", "--out", tmp_path / "out")
     own = arguments.index("--plan-samples")
