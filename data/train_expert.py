@@ -380,6 +380,7 @@ class Training:
         # these, like the planner, may change between two stretches of a run
         self.settings["config"].pop("updates_per_step")
         self.settings["distill"].pop("steps", None)
+        self.planners()  # what they refuse is missed now, not after the random episodes
 
     @property
     def models(self):
@@ -426,10 +427,11 @@ class Training:
         planning = dataclasses.replace(self.planning, horizon=self.scheduled()["horizon"])
         planners = {"expert": (self.learner.model, planning)}
         if self.student:
-            config = self.student.config
+            config, around = self.student.config, fac.student_planning(self.student.config)
+            few = planning.elites <= around.get("samples", planning.samples)
             planners["student"] = self.student.model, dataclasses.replace(
                 planning, horizon=min(planning.horizon, config.horizon),
-                **fac.student_planning(config))
+                elites=planning.elites if few else 0, **around)
         return planners
 
     def tests(self):

@@ -280,6 +280,9 @@ def test_evaluations_are_of_episodes_apart_and_of_each_model_s_horizon():
     planners = found.planners()
     assert planners["expert"][1].horizon == 3 and planners["student"][1].horizon == 1
     assert planners["student"][0] is found.student.model
+    for elites, own in ((64, 0), (8, 8)):  # a student has 32 samples
+        found = training("--plan-samples", "512", "--plan-elites", str(elites))
+        assert [found.planners()[name][1].elites for name in found.models] == [elites, own]
 
 
 def test_every_update_has_states_and_perturbations_of_its_own(monkeypatch):
@@ -430,6 +433,7 @@ def test_another_run_s_files_are_not_replaced(tmp_path, name):
     (["--num-agents", "2"], ["[1, 3]"]),
     (["--num-agents", "0"], ["[1, 3]"]),
     (["--std-start", "3"], ["std_start", "2.0"]),
+    (["--student", "fac", "--plan-min-std", "0.2"], ["min_std", "0.15"]),
     (["--distill-batch-size", "9"], ["--distill-batch-size 9", "at most", "(8)"]),
     (["--out", fac.__file__], ["can't be read or written"]),
     (["--out", "x" * 300], ["can't be read or written"]),
