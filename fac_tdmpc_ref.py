@@ -1285,9 +1285,9 @@ def homogeneous(params, layer):
     return np.block([[W, b], [np.zeros_like(W[:, :1]), np.ones_like(b[:, :1])]])
 
 
-def side_by_side(params, names, i):
-    """Layer i of several networks as one homogeneous matrix: their outputs, one below the other."""
-    return np.concatenate([homogeneous(params, f"{name}.{i}") for name in names], 1)
+def side_by_side(params, names):
+    """First layers of several networks as one homogeneous matrix: outputs, one below the other."""
+    return np.concatenate([homogeneous(params, f"{name}.0") for name in names], 1)
 
 
 class Returns:
@@ -1301,7 +1301,7 @@ class Returns:
     def __init__(self, model):
         self.sizes, p = model.config, model.params  # below, w is the hidden width
         step, both_q = ("_dynamics", "_reward"), ("_Q1", "_Q2")
-        self.first = [side_by_side(p, step, 0), self._fold_norm(p)]     # (N, 2w + 2, m + d + 1)
+        self.first = [side_by_side(p, step), self._fold_norm(p)]        # (N, 2w + 2, m + d + 1)
         self.second = [[homogeneous(p, f"{name}.{i}") for name in pair]  # (N, w + 1, w + 1)
                        for pair, i in ((step, 2), (both_q, 3))]
         self.to_latent, self.to_reward, *to_q = (
@@ -1316,7 +1316,7 @@ class Returns:
         `spread` takes the gains out of the variance again. The row of ones becomes zeros here,
         and 20 by `shift`, which tanh takes to 1."""
         rows = (self.sizes.num_agents, 2, self.sizes.mlp_dim + 1)
-        W = side_by_side(p, ("_Q1", "_Q2"), 0).reshape(*rows, -1)
+        W = side_by_side(p, ("_Q1", "_Q2")).reshape(*rows, -1)
         W[:, :, -1] = 0
         W[:, :, :-1] -= W[:, :, :-1].mean(2, keepdims=True)
         gain, self.shift = np.ones((*rows, 1), F32), np.full((*rows, 1), F32(20))
