@@ -2465,11 +2465,14 @@ def evaluate_both(expert, student, record, args):
 
 def time_both(expert, student, obs):
     """Milliseconds of a decision, the expert's with its proposals, the student also with a process
-    on each core; where that costs more than it saves, it counts as planning in one. For result."""
+    on each core; where that costs more than it saves, or can't be (in a pool's process, under a
+    profiler), it counts as planning in one. For result."""
     beside = useful_workers(student[0].config.num_agents)
     with contextlib.ExitStack() as stack:
-        acts = [stack.enter_context(Planner(*planned, workers=workers)).act
-                for planned, workers in ((expert, 0), *((student, n) for n in sorted({0, beside})))]
+        acts = [stack.enter_context(Planner(*planned)).act for planned in (expert, student)]
+        with contextlib.suppress(UserError):
+            if beside:
+                acts.append(stack.enter_context(Planner(*student, workers=beside)).act)
         seconds = interleaved_seconds([functools.partial(act, obs) for act in acts], 20, "timing")
     central, alone, *parallel = (1e3 * np.median(seconds, 0)).tolist()
     best = min([alone, *parallel])

@@ -486,6 +486,17 @@ def test_distill_times_workers_only_where_there_are_cores(cores, seconds, worker
     assert (found["plan_ms_student_in_process"], found["speedup"]) == (2000, 4000 / best)
 
 
+def test_a_pool_s_process_times_itself_alone(monkeypatch):
+    """It can't start workers, which distill --workers 0 doesn't need for anything else."""
+    monkeypatch.setattr(fac, "cores", lambda: 2)
+    monkeypatch.setattr(fac.multiprocessing, "current_process",
+                        lambda: SimpleNamespace(daemon=True))
+    planning = fac.PlannerConfig(8, 1)
+    found = fac.time_both((random_model(1), planning), (random_model(), planning), np.zeros(8))
+    assert found["plan_workers"] == 0
+    assert found["plan_ms_student"] == found["plan_ms_student_in_process"] > 0
+
+
 def test_timings_take_turns_and_drop_the_first_round(monkeypatch):
     """One that takes 9 seconds the first time and 1 later, and one that takes 2."""
     clock, called, takes = [0.0], [], {"a": [9, 1, 1, 1], "b": [2, 2, 2, 2]}
