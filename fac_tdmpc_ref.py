@@ -720,7 +720,6 @@ import tempfile
 import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
 from multiprocessing import resource_tracker
 from pathlib import Path
 
@@ -1928,7 +1927,7 @@ def save_model(path, model, header, compress=False):
         value = value[..., 0] if key.endswith("bias") or key.split(".")[1] == "1" else value
         need(np.isfinite(value).all(), f"{path}: {key}: would hold values that are not finite")
         arrays[key] = value[0] if len(value) == 1 else value
-    write_npz(path, {**header, "model": asdict(model.config)}, arrays, compress)
+    write_npz(path, {**header, "model": vars(model.config)}, arrays, compress)
 
 
 def load_model(path, kinds=("expert", "student")):
@@ -2407,7 +2406,7 @@ def distil_and_save(distiller, args, planning, header, out):
     sizes = student.config
     settings = {"task": args.task, "seed": args.seed,
                 "num_agents": sizes.groups or sizes.num_agents,
-                "distill": asdict(config), "data": data_checksums(distiller.expert, replay),
+                "distill": vars(config), "data": data_checksums(distiller.expert, replay),
                 "action_repeat": planning.action_repeat}
     if (path := out / "student.npz").exists():  # a run that this one would replace
         before, _ = read_npz(path, ("student",))
@@ -2424,11 +2423,11 @@ def distil_and_save(distiller, args, planning, header, out):
         search, gain = student_search(distiller, planning)
         samples = max(search.get("samples", planning.samples), planning.elites)  # a flag's elites
         planning = from_args(PlannerConfig, args, **{
-            **asdict(planning), **search, "samples": samples})
+            **vars(planning), **search, "samples": samples})
     save_model(out / "student.npz", student, {
         "kind": "student", **settings, "training": header.get("training", {}),
         "planner": {name: getattr(planning, name) for name in STUDENT_PLANNING}})
-    write_json(out / "config.json", {**settings, "planner": asdict(planning)})
+    write_json(out / "config.json", {**settings, "planner": vars(planning)})
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
             "steps": config.steps, "seconds": round(seconds, 1), "seconds_total": before,
             "kl_reward": curve[-1][3], "kl_value": curve[-1][4],
