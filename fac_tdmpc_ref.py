@@ -2345,9 +2345,10 @@ def record_returns(path, model, config, seed, returns):
 def command_distill(args):
     """distill: expert and replay in, student, learning curve, table and JSON out."""
     began = time.time()
-    preset = functools.partial(preset_values, preset="plain" if args.plain else args.preset)
-    config = from_args(DistillConfig, args, **preset(DistillConfig),
-                       **({"reuse": 1} if args.plain else {}))
+    named = "plain" if args.plain and args.preset == "default" else args.preset
+    preset = functools.partial(preset_values, preset=named)
+    config = from_args(DistillConfig, args, **{
+        **preset(DistillConfig), **({"reuse": 1} if args.plain else {})})
     expert, header, replay, path = load_data(args)
     theirs = {**preset(PlannerConfig), **made_for(header, path)}
     own = PlannerConfig(**theirs)  # the expert's
@@ -2625,8 +2626,8 @@ def make_parser():
     add("--preset", choices=("default", "plain", "paper"), default="default", help="paper: the "
         "paper's value of every setting that names one below (days on a laptop); plain: the "
         "paper's method at this project's budget, without what it adds [D8] [D9]")
-    add("--plain", action="store_true", help="Part I of the module alone: the plain preset by the "
-        "loop and the planner that it reads; slower, and not resumed")
+    add("--plain", action="store_true", help="Part I of the module alone: the plain preset, or "
+        "the paper's, by the loop and the planner that it reads; slower, and not resumed")
     add("--expert", help="expert file, or a folder with expert.npz and replay.npz [data/TASK]")
     add("--replay", help="replay file [replay.npz beside the expert]")
     add("--out", help="folder for the results [runs/TASK-SEED]")

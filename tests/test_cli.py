@@ -213,6 +213,13 @@ def test_preset_plain_is_the_paper_s_method_at_our_budget(monkeypatch):
     assert planner == fac.PlannerConfig()
 
 
+def test_plain_takes_a_preset_that_is_named(monkeypatch):
+    for name, flags in (("plain", []), ("paper", ["--preset", "paper"])):
+        config, planner = configs_of(monkeypatch, "distill", "--preset", name)
+        assert configs_of(monkeypatch, "distill", "--plain", *flags) == (
+            dataclasses.replace(config, reuse=1), dataclasses.replace(planner, returns="plain"))
+
+
 def test_flags_go_before_the_preset(monkeypatch):
     config, *_ = configs_of(monkeypatch, "distill", "--preset", "paper", "--steps", 7, "--kl",
                             "forward")
