@@ -1301,8 +1301,8 @@ class Returns:
         self.sizes, p = model.config, model.params  # below, w is the hidden width
         step, both_q = ("_dynamics", "_reward"), ("_Q1", "_Q2")
         self.first = [side_by_side(p, step), self._fold_norm(p)]        # (N, 2w + 2, m + d + 1)
-        self.second = [[homogeneous(p, f"{name}.{i}") for name in pair]  # (N, w + 1, w + 1)
-                       for pair, i in ((step, 2), (both_q, 3))]
+        self.second = [np.stack([homogeneous(p, f"{name}.{i}") for name in pair], 1)
+                       for pair, i in ((step, 2), (both_q, 3))]         # (N, 2, w + 1, w + 1)
         self.to_latent, self.to_reward, *to_q = (
             homogeneous(p, f"{name}.{i}")[:, :-1].copy()
             for name, i in (*((name, 4) for name in step), *((name, 5) for name in both_q)))
@@ -1361,10 +1361,8 @@ class Returns:
         y = (self.first[pair] @ x if h else
              self.first_at_start[pair] @ x[:, self.sizes.latent_dim:])
         y = self._norm_tanh(y) if pair else elu(y)
-        after, half = np.empty_like(y), y.shape[1] // 2
-        for W, rows in zip(self.second[pair], (slice(0, half), slice(half, None))):
-            np.matmul(W, y[:, rows], out=after[:, rows])
-        return elu(after)
+        after = self.second[pair] @ y.reshape(len(y), 2, -1, y.shape[2])
+        return elu(after.reshape(y.shape))
 
     def _norm_tanh(self, y):
         """tanh(LayerNorm(y)) of both Q."""
