@@ -1278,15 +1278,12 @@ def rank_results(distiller, states, discount):
 # ---- Plans: `Returns` computes h_step_return.
 
 
-def homogeneous(params, layer):
-    """A layer as one matrix on inputs whose last row is 1: [[W, b], [0, 1]], (N, out+1, in+1)."""
-    W, b = params[f"{layer}.weight"], params[f"{layer}.bias"]
-    return np.block([[W, b], [np.zeros_like(W[:, :1]), np.ones_like(b[:, :1])]])
-
-
-def side_by_side(params, names):
-    """First layers of several networks as one homogeneous matrix: outputs, one below the other."""
-    return np.concatenate([homogeneous(params, f"{name}.0") for name in names], 1)
+def homogeneous(params, *layers):
+    """Layers of one size as matrices on inputs whose last row is 1, (N, layers, out + 1, in + 1):
+    [[W, b], [0, 1]] each."""
+    W, b = (np.stack([params[f"{layer}.{part}"] for layer in layers], 1)
+            for part in ("weight", "bias"))
+    return np.block([[W, b], [np.zeros_like(W[..., :1, :]), np.ones_like(b[..., :1, :])]])
 
 
 class Returns:
@@ -1299,13 +1296,13 @@ class Returns:
 
     def __init__(self, model):
         self.sizes, p = model.config, model.params  # below, w is the hidden width
-        step, both_q = ("_dynamics", "_reward"), ("_Q1", "_Q2")
-        self.first = [side_by_side(p, step), self._fold_norm(p)]        # (N, 2w + 2, m + d + 1)
-        self.second = [np.stack([homogeneous(p, f"{name}.{i}") for name in pair], 1)
-                       for pair, i in ((step, 2), (both_q, 3))]         # (N, 2, w + 1, w + 1)
+        first = homogeneous(p, "_dynamics.0", "_reward.0"), self._fold_norm(p)
+        self.first = [W.reshape(len(W), -1, W.shape[3]) for W in first]  # (N, 2w + 2, m + d + 1)
+        self.second = [homogeneous(p, "_dynamics.2", "_reward.2"),      # (N, 2, w + 1, w + 1)
+                       homogeneous(p, "_Q1.3", "_Q2.3")]
         self.to_latent, self.to_reward, *to_q = (
-            homogeneous(p, f"{name}.{i}")[:, :-1].copy()
-            for name, i in (*((name, 4) for name in step), *((name, 5) for name in both_q)))
+            np.concatenate([p[f"{layer}.weight"], p[f"{layer}.bias"]], 2)
+            for layer in ("_dynamics.4", "_reward.4", "_Q1.5", "_Q2.5"))
         self.to_q = np.concatenate(to_q, 2) / 2                         # (N, 1, 2w + 2)
 
     def _fold_norm(self, p):
@@ -1314,8 +1311,8 @@ class Returns:
         Centred rows give centred outputs, and a row times its gain gives its output times it;
         `spread` takes the gains out of the variance again. The row of ones becomes zeros here,
         and 20 by `shift`, which tanh takes to 1."""
-        rows = (self.sizes.num_agents, 2, self.sizes.mlp_dim + 1)
-        W = side_by_side(p, ("_Q1", "_Q2")).reshape(*rows, -1)
+        W = homogeneous(p, "_Q1.0", "_Q2.0")
+        rows = W.shape[:3]
         W[:, :, -1] = 0
         W[:, :, :-1] -= W[:, :, :-1].mean(2, keepdims=True)
         gain, self.shift = np.ones((*rows, 1), F32), np.full((*rows, 1), F32(20))
@@ -1325,7 +1322,7 @@ class Returns:
         gain[np.abs(gain) < 1e-12] = 1e-12
         W *= gain
         self.spread = (1 / (self.sizes.mlp_dim * gain ** 2)).swapaxes(2, 3)
-        return W.reshape(len(W), -1, W.shape[-1])
+        return W
 
     def start(self, z, config):
         """Plan from the latent z (N, m, 1): at h = 0 the first products read (a, 1) only."""
