@@ -890,6 +890,8 @@ def planning_numbers(sizes, config):
 # how a student plans that was taught around its expert's policy, if its file says nothing else
 STUDENT_PLANNING = {"prior": "policy", "max_std": 0.15, "samples": 32, "iterations": 3,
                     "output": "mean"}
+SEARCH = [f.name for f in dataclasses.fields(PlannerConfig)  # what a student's file says of it
+          if f.name not in ("horizon", "discount", "returns", "action_repeat")]
 WIDE_SEARCH = {"max_std": 1.0}  # see `student_search`
 MANY_AGENTS, SMALL_SEARCH = 12, {"samples": 16, "iterations": 2}
 
@@ -1953,7 +1955,7 @@ def made_for(header, where):
     horizon and action repeat, those that it names. The one place that reads them."""
     found, there = {}, f"{where}: header"
     for group, names in (("training", ("discount", "horizon")), ("distill", ("horizon",)),
-                         ("planner", STUDENT_PLANNING)):
+                         ("planner", SEARCH)):
         settings = header.get(group) or {}
         need(isinstance(settings, dict), f"{there}: {group}: expected settings, found "
              f"{settings!r}")
@@ -2422,7 +2424,7 @@ def distil_and_save(distiller, args, planning, header, out):
             **vars(planning), **search, "samples": samples})
     save_model(out / "student.npz", student, {
         "kind": "student", **settings, "training": header.get("training", {}),
-        "planner": {name: getattr(planning, name) for name in STUDENT_PLANNING}})
+        "planner": {name: getattr(planning, name) for name in SEARCH}})
     write_json(out / "config.json", {**settings, "planner": vars(planning)})
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
             "steps": config.steps, "seconds": round(seconds, 1), "seconds_total": before,
