@@ -413,11 +413,14 @@ def test_distill_prints_json_and_a_table(distilled):
     policy = np.mean(result["policy_returns"])
     assert len(result["policy_returns"]) == 1 and f"{policy:.0f} ± 0" in table
     header, _ = fac.read_npz(folder / "student.npz", ("student",))
-    planning = fac.PlannerConfig(**{**fac.STUDENT_PLANNING, "samples": 16, "iterations": 1})
+    gain, error = result["wide_search_gain"]
+    width = (fac.WIDE_SEARCH if gain > 2 * error else fac.STUDENT_PLANNING)["max_std"]
+    planning = fac.PlannerConfig(**{**fac.STUDENT_PLANNING, "samples": 16, "iterations": 1,
+                                    "max_std": width})
     assert header["planner"].items() <= vars(planning).items()
     assert {*vars(planning)} - {*header["planner"]} == {
         "horizon", "discount", "returns", "action_repeat"}
-    assert (result["max_std"], result["samples"]) == (fac.STUDENT_PLANNING["max_std"], 16)
+    assert (result["max_std"], result["samples"]) == (width, 16)
 
 
 @pytest.mark.parametrize("flags, gain, expected", [
