@@ -120,7 +120,7 @@ class PlannerConfig(Settings):
 @dataclasses.dataclass(frozen=True)
 class DistillConfig(Settings):
     """Algorithm 1. `--preset paper` takes each field's paper value."""
-    steps: int = field(7_000, "gradient steps (section 5.1: 10^5) [D1]", paper=100_000, least=1)
+    steps: int = field(14_000, "gradient steps (section 5.1: 10^5) [D1]", paper=100_000, least=1)
     batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=2)
     noise_samples: int = field(5, "K: perturbations of each action [D1]", paper=10, least=2)
     noise_std: float = field(0.3, "of the perturbations [D9]", paper=0.5, plain=0.5, above=0)

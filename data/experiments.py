@@ -839,7 +839,7 @@ def make_parser():
         return sub
 
     walkers = ["walker-walk", "walker-run"]
-    curve = {"steps": fac.DistillConfig.steps, "evaluations": 4, "episodes": 5}
+    curve = {"steps": 5000, "evaluations": 4, "episodes": 5}
     shipped = [task for task in sorted(fac.TASKS) if (fac.DATA / task / "expert.npz").exists()]
     add_runs("figure4", lambda args: distil_all(args, lambda _: FIGURE4.items()),
              "Section 5.2: Fac-TDMPC, TD-MPC in Table 2's size and the small one of B.2, and TAP, "
@@ -849,7 +849,7 @@ def make_parser():
              "(clipped), the student's temperature, a consistency loss.", walkers, **curve)
     add_runs("departures", command_departures, "The differences in distillation one at a time, "
              "towards the paper's values.", ["reacher-hard", "walker-walk"],
-             steps=fac.DistillConfig.steps, evaluations=1, episodes=10)
+             steps=5000, evaluations=1, episodes=10)
     for name, run, help, episodes in (
             ("figure7", command_figure7, "Section 5.4: samples and iterations, expert and student: "
              "returns, then milliseconds (keep the machine quiet for these).", 4),

@@ -230,7 +230,7 @@ def test_a_run_that_does_not_fit_its_figure_is_refused_before_the_work(tmp_path)
     write_rows(tmp_path / "4.csv", [("walker-run", 0, "TAP", {"steps": 3}, [{"minutes": 1.0}])])
     before = (tmp_path / "4.csv").read_bytes()
     refused(run("figure4", "--tasks", "walker-run", "--out", "4.csv", cwd=tmp_path), "4.csv: TAP",
-            "'steps': 3", "'steps': 7000", "--out")
+            "'steps': 3", "'steps': 5000", "--out")
     assert (tmp_path / "4.csv").read_bytes() == before
 
 
@@ -1100,7 +1100,7 @@ def test_a_preset_s_students_have_its_budget_and_a_folder_of_their_own(monkeypat
         assert experiments.main(["students", "--tasks", "walker-run", "--seeds", "0", *flags]) == 0
     found = [(run["case"], *(json.loads(run["settings"]).get(k) for k in (
         "steps", "samples", "iterations"))) for run in seen]
-    assert found == [("default", 7000, None, None), ("paper", 100000, None, None),
+    assert found == [("default", 14000, None, None), ("paper", 100000, None, None),
                      ("paper", 14000, 128, 4)]
     assert [str(students.folder("runs", "walker-run", 0, preset)) for preset in (
         "default", "paper")] == ["runs/walker-run-0", "runs/walker-run-0-paper"]
