@@ -1423,14 +1423,16 @@ def student_search(distiller, planning, states=256):
 
     Far from the policy are better plans, and plans that only the student's errors promise. So it
     searches widely if, by two standard errors, the expert thinks more of the plans it finds so in
-    held-out states. A narrow search of many agents, where samples cost most, needs fewer."""
+    held-out states. A narrow search of many agents, where samples cost most, needs fewer, though
+    no fewer than the elites that `planning` asks for."""
     rows = stream(distiller.seed, "search").choice(distiller.held_out_starts, states)
     obs, _ = distiller.replay.sequences(rows, 1)
     wide = dataclasses.replace(planning, max_std=max(planning.max_std, WIDE_SEARCH["max_std"]))
     gains = np.subtract(*(plan_gains(distiller.expert, distiller.student, config, obs)[0]
                           for config in (wide, planning)))
     gain, error = float(gains.mean()), float(gains.std(ddof=1) / states ** 0.5)
-    narrow = SMALL_SEARCH if distiller.student.config.num_agents >= MANY_AGENTS else {}
+    small = {**SMALL_SEARCH, "samples": max(SMALL_SEARCH["samples"], planning.elites)}
+    narrow = small if distiller.student.config.num_agents >= MANY_AGENTS else {}
     return WIDE_SEARCH if gain > 2 * error else narrow, (gain, error)
 
 
@@ -1952,7 +1954,7 @@ def load_model(path, kinds=("expert", "student")):
 
 def made_for(header, where):
     """What a model's file was trained, or distilled, for, as settings of a PlannerConfig: discount,
-    horizon and action repeat, those that it names. The one place that reads them."""
+    horizon, action repeat and SEARCH, those that it names. The one place that reads them."""
     found, there = {}, f"{where}: header"
     for group, names in (("training", ("discount", "horizon")), ("distill", ("horizon",)),
                          ("planner", SEARCH)):
@@ -2022,6 +2024,15 @@ class Replay:
         """First observations (O, B) and actions (L, A, B), float32, from the rows `starts` on."""
         actions = self.action[starts + np.arange(length)[:, None]]
         return self.observation[starts].T.astype(F32), actions.swapaxes(1, 2).astype(F32)
+
+
+def load_replay(path, repeat):
+    """A Replay whose file names no other action repeat than this."""
+    replay = Replay(path)
+    found = made_for(replay.header, path).get("action_repeat", repeat)
+    need(found == repeat, f"{path}: header: action_repeat: expected {repeat}, as the expert was "
+         f"made for, found {found}; pass its own data")
+    return replay
 
 
 def checksum(arrays):
@@ -2388,15 +2399,6 @@ def load_data(args):
     return expert, header, replay, path
 
 
-def load_replay(path, repeat):
-    """A Replay whose file names no other action repeat than this."""
-    replay = Replay(path)
-    found = made_for(replay.header, path).get("action_repeat", repeat)
-    need(found == repeat, f"{path}: header: action_repeat: expected {repeat}, as the expert was "
-         f"made for, found {found}; pass its own data")
-    return replay
-
-
 def distil_and_save(distiller, args, planning, header, out):
     """Algorithm 1 to its end; writes student, curve and configuration. Returns result's part, and
     the student's planning, around the policy by `student_search` where no flag says otherwise."""
@@ -2419,9 +2421,7 @@ def distil_and_save(distiller, args, planning, header, out):
     ranks, gain = rank_results(distiller, 256, planning.discount), None
     if planning.prior == "policy":
         search, gain = student_search(distiller, planning)
-        samples = max(search.get("samples", planning.samples), planning.elites)  # a flag's elites
-        planning = from_args(PlannerConfig, args, **{
-            **vars(planning), **search, "samples": samples})
+        planning = from_args(PlannerConfig, args, **{**vars(planning), **search})
     save_model(out / "student.npz", student, {
         "kind": "student", **settings, "training": header.get("training", {}),
         "planner": {name: getattr(planning, name) for name in SEARCH}})

@@ -57,9 +57,9 @@ def kept(rows):
 def planning_wins(rows, key):
     """What planning with a model, whose returns are `key`'s, wins over the expert's policy in the
     same episodes: its mean ± standard error over episodes. rows: {evaluation seed: rows by seed}"""
-    found = [np.mean([np.subtract(json.loads(row[key]), json.loads(row["policy_returns"]))
-                      for row in rows[seed]], 0) for seed in EVALUATION_SEEDS]
-    found = np.concatenate(found)
+    found = np.concatenate([
+        np.mean([np.subtract(json.loads(row[key]), json.loads(row["policy_returns"]))
+                 for row in rows[seed]], 0) for seed in EVALUATION_SEEDS])
     return f"{found.mean():.0f} ± {found.std(ddof=1) / len(found) ** 0.5:.0f}"
 
 
