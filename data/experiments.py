@@ -776,8 +776,8 @@ correlation of G; every run's settings are in its CSV. Figure 12's ratio is one 
 episodes and joints lie, bold without 0 in it; where a row holds no episode's return, its mean has
 the luck that its deviation allows, the same for all joints of a model. '10% TD-MPC' has hidden
 layers of 66 (B.2), which with Table 2's latents of 50 is 3% of the weights behind the encoder; six
-agents have 26%. One agent has layers of 512, the experts of hopper, fish, quadruped and humanoid of
-256. Figure 13: latents of 50 an agent, so 50 N in all.
+agents have 26%. One agent's layers are as wide as its expert's, N agents' an Nth of that. Figure
+13: latents of 50 an agent, so 50 N in all.
 
 """
 REPORTS = {"students": report_students, "figure4": report_curves, "figure5": report_curves,
