@@ -362,9 +362,12 @@ def test_rows_of_another_kind_are_refused(tmp_path, found):
         experiments.read_rows(tmp_path / "x.csv")
 
 
-def test_every_method_of_figure_4_learns_and_plans():
+def test_every_method_of_figure_4_learns_and_plans(monkeypatch):
     """Rows at each evaluation; 10% TD-MPC has few weights; TAP plans latent actions."""
     weights = {}
+    monkeypatch.setattr(fac, "CONTROL_STEPS", 40)  # of an episode
+    monkeypatch.setattr(baselines.TapDistiller, "__init__", functools.partialmethod(
+        baselines.TapDistiller.__init__, vae_steps=30))
     for case, settings in experiments.FIGURE4.items():
         kind = baselines.distiller_of(case)
         expert, _ = fac.load_model(fac.data_file("cheetah-run", "expert.npz"))
