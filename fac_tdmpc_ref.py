@@ -2155,9 +2155,8 @@ def progress(label, total, unit, initial=0):
 
 
 def interleaved_seconds(calls, rounds, label):
-    """Seconds of functions that are called one after the other, again and again: (rounds, calls).
-
-    So noise hits all alike. One BLAS thread leaves cores to workers. A first round is dropped."""
+    """Seconds of functions that are called in turn, so that noise hits all alike: (rounds, calls),
+    without a first round. One BLAS thread leaves cores to workers."""
     seconds = np.zeros((rounds + 1, len(calls)))
     with one_thread(), progress(label, rounds + 1, "round") as bar:
         for row in seconds:
@@ -2183,11 +2182,9 @@ CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correla
 
 
 def train_student(distiller, out, settings, planning, workers):
-    """Algorithm 1 to its end, with a learning curve and checkpoints in the folder `out`.
-
-    A run that was cut off goes on from its checkpoint to the same end (UserError: it is damaged, or
-    another run's). Returns (curve rows, seconds, those before it went on). workers: that play the
-    expert's episodes [D8]."""
+    """Algorithm 1 to its end, with a learning curve and checkpoints in the folder `out`, from which
+    a run that was cut off goes on to the same end (UserError: one is damaged, or another run's).
+    workers: that play the expert's episodes [D8]. Returns curve rows, seconds, those before."""
     checkpoint, config, curve, before = out / "checkpoint.npz", distiller.config, [], 0.0
     if checkpoint.exists():
         header, arrays = read_npz(checkpoint, ("checkpoint",))
@@ -2366,7 +2363,7 @@ def command_distill(args):
         **({"returns": "plain"} if args.plain else {})})
     distiller_class = PlainDistiller if args.plain else Distiller
     out = Path(args.out or f"runs/{args.task}-{args.seed}")
-    record = recorded_returns(path, expert, own, args.eval_seed)
+    read_records(path)  # what is damaged is missed now
     with contextlib.closing(distiller_class(expert, replay, config, args.num_agents,
                                             args.seed)) as distiller, locked(out):
         for model, config in ((expert, own), (distiller.student, planning)):
@@ -2375,7 +2372,7 @@ def command_distill(args):
         result, planning = distil_and_save(distiller, args, planning, header, out)
         obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
         both = (expert, own), (distiller.student, planning)
-        result.update(evaluate_both(*both, record, args))
+        result.update(evaluate_both(*both, path, args))
         result.update(time_both(*both, obs))
         result["seconds_total"] = round(result["seconds_total"] + time.time() - began, 1)
         write_json(out / "result.json", result)
@@ -2435,71 +2432,84 @@ def distil_and_save(distiller, args, planning, header, out):
                              f"{args.task}, seed {args.seed}")}, planning
 
 
-def evaluate_both(expert, student, record, args):
-    """The student's returns and the expert's, from its record or measured: result's part.
+COMPARED = {"expert": "the expert", "student": "the student", "policy": "its policy alone",
+            "same_search": "expert, searching like its student"}
 
-    expert, student: (model, planning), each over its own horizon; record: (returns, software)."""
-    def returns_of(model, planning, label):
-        return evaluate(model, args.task, planning, args.episodes, args.eval_seed, args.workers,
-                        label)["returns"]
 
-    students, (experts, versions) = returns_of(*student, "evaluating the student"), record
-    recorded = len(experts) >= args.episodes and not args.evaluate_expert
-    experts, versions = (experts[:args.episodes], versions) if recorded else (
-        returns_of(*expert, "evaluating the expert"), software())
-    policy = dataclasses.replace(expert[1], prior="policy", iterations=0)
-    return {"policy_returns": returns_of(expert[0], policy, "evaluating its policy alone")
-            if expert[0].has_policy else None,
-            "episodes": args.episodes, "eval_seed": args.eval_seed, "expert_recorded": recorded,
-            "expert_versions": versions, "expert_horizon": expert[1].horizon,
-            "student_horizon": student[1].horizon,
-            "expert_return_mean": float(np.mean(experts)),
-            "expert_return_std": float(np.std(experts)), "expert_returns": experts,
-            "student_return_mean": float(np.mean(students)),
-            "student_return_std": float(np.std(students)), "student_returns": students,
-            "kept": return_kept(np.mean(students), np.mean(experts))}
+def compared(expert, student):
+    """What distill compares, (model, planning) by COMPARED's keys: these two, the expert's policy
+    alone, and the expert searching around it like its student [D9]: what the model alone saves."""
+    (model, own), search = expert, {name: getattr(student[1], name) for name in SEARCH}
+    found = {"expert": expert, "student": student}
+    if model.has_policy:
+        found["policy"] = model, dataclasses.replace(own, prior="policy", iterations=0)
+    if search["prior"] == "policy":
+        found["same_search"] = model, dataclasses.replace(own, **{**search, "pi_trajs": 0})
+    return found
+
+
+def evaluate_both(expert, student, path, args):
+    """The returns of all that is `compared`, from the record beside the expert's file `path`, or
+    measured: result's part. expert, student: (model, planning), each over its own horizon."""
+    found = {"episodes": args.episodes, "eval_seed": args.eval_seed}
+    for name, (model, planning) in compared(expert, student).items():
+        returns, versions = recorded_returns(path, model, planning, args.eval_seed)
+        recorded = len(returns) >= args.episodes and not args.evaluate_expert
+        if not recorded:
+            versions, returns = software(), evaluate(
+                model, args.task, planning, args.episodes, args.eval_seed, args.workers,
+                f"evaluating {COMPARED[name]}")["returns"]
+        returns = returns[:args.episodes]
+        found.update({f"{name}_{key}": value for key, value in {
+            "returns": returns, "return_mean": float(np.mean(returns)), "return_std": float(
+                np.std(returns)), "horizon": planning.horizon, "recorded": recorded,
+            "versions": versions}.items()})
+    return {**found, "kept": return_kept(found["student_return_mean"], found["expert_return_mean"])}
 
 
 def time_both(expert, student, obs):
-    """Milliseconds of a decision, the expert's with its proposals, the student also with a process
-    on each core; where that costs more than it saves, or can't be (in a pool's process, under a
-    profiler), it counts as planning in one. For result."""
-    beside = useful_workers(student[0].config.num_agents)
+    """Milliseconds of a decision with all that is `compared`, in this process, and of the student
+    with a process on each core; where that costs more than it saves, or can't be (in a pool's
+    process, under a profiler), it counts as planning in one. For result."""
+    workers = useful_workers(student[0].config.num_agents)
     with contextlib.ExitStack() as stack:
-        acts = [stack.enter_context(Planner(*planned)).act for planned in (expert, student)]
+        acts = {name: stack.enter_context(Planner(*planned)).act
+                for name, planned in compared(expert, student).items()}
         with contextlib.suppress(UserError):
-            if beside:
-                acts.append(stack.enter_context(Planner(*student, workers=beside)).act)
-        seconds = interleaved_seconds([functools.partial(act, obs) for act in acts], 20, "timing")
-    central, alone, *parallel = (1e3 * np.median(seconds, 0)).tolist()
-    best = min([alone, *parallel])
-    return {"plan_ms_expert": central, "plan_ms_student_in_process": alone, "plan_ms_student": best,
-            "speedup": central / best, "plan_workers": beside if best < alone else 0}
+            if workers:
+                acts["workers"] = stack.enter_context(Planner(*student, workers=workers)).act
+        seconds = interleaved_seconds([functools.partial(act, obs) for act in acts.values()], 20,
+                                      "timing")
+    ms = dict(zip(acts, (1e3 * np.median(seconds, 0)).tolist()))
+    alone, beside = ms.pop("student"), ms.pop("workers", np.inf)
+    return {**{f"plan_ms_{name}": value for name, value in ms.items()},
+            "plan_ms_student_in_process": alone, "plan_ms_student": (best := min(alone, beside)),
+            "speedup": ms["expert"] / best, "plan_workers": workers if best < alone else 0}
 
 
 def report(result, plannings):
     """Print distill's table. plannings: the expert's and the student's."""
-    expert, student = (f"{result[f'{kind}_return_mean']:.0f} ± {result[f'{kind}_return_std']:.0f}"
-                       for kind in ("expert", "student"))
     source = "measured now" if not result["expert_recorded"] else "recorded" if (
         result["expert_versions"] == software()) else "recorded with other versions"
     horizons = [result[f"{kind}_horizon"] for kind in ("expert", "student")]
     over = [f", H = {h}" if horizons[0] != horizons[1] else "" for h in horizons]
     budgets = [f"{config.samples} x {config.iterations}" for config in plannings]
-    rows = [(f"expert ({source}), one process{over[0]}", budgets[0], expert,
-             result["plan_ms_expert"]),
-            (f"student, N = {result['num_agents']}, one process{over[1]}", budgets[1], student,
-             result["plan_ms_student_in_process"]),
-            (f"student, workers beside: {result['plan_workers']}", "", "the same plans",
-             result["plan_ms_student"])][:3 if result["plan_workers"] else 2]
     print(f"\n{result['task']}, {result['episodes']} episodes, evaluation seed "
           f"{result['eval_seed']}, horizon {' and '.join(map(str, dict.fromkeys(horizons)))}\n")
-    table = [(name, budget, returns, f"{ms:.1f}", f"{rows[0][3] / ms:.1f}")
-             for name, budget, returns, ms in rows]
-    if policy := result["policy_returns"]:
-        table.insert(1, ("its policy alone", "0", f"{np.mean(policy):.0f} ± {np.std(policy):.0f}",
-                         "", ""))
-    print_table([("", "MPPI", "return", "ms a decision", "speed-up"), *table])
+    rows = [("", "MPPI", "return", "ms a decision", "speed-up")]
+    for name, budget, who in (
+            (f"expert ({source}), one process{over[0]}", budgets[0], "expert"),
+            (COMPARED["policy"], "0", "policy"),
+            (COMPARED["same_search"], budgets[1], "same_search"),
+            (f"student, N = {result['num_agents']}, one process{over[1]}", budgets[1], "student"),
+            (f"student, workers beside: {result['plan_workers']}", "", "workers")):
+        found, about = result.get(f"{who}_returns"), {
+            "student": "student_in_process", "workers": "student"}.get(who, who)
+        if found or who == "workers" and result["plan_workers"]:
+            ms = result[f"plan_ms_{about}"]
+            rows.append((name, budget, f"{np.mean(found):.0f} ± {np.std(found):.0f}" if found else
+                         "the same plans", f"{ms:.1f}", f"{result['plan_ms_expert'] / ms:.1f}"))
+    print_table(rows)
     q, g, known, error = (result[f"rank_correlation_{key}"] for key in (
         "by_step", "returns", "returns_training", "returns_se"))
     kept = "-" if result["kept"] is None else f"{result['kept']:.2f}"

@@ -10,9 +10,11 @@ import fac_tdmpc_ref as fac  # noqa: E402
 from tables import deviation, markdown, of_returns  # noqa: E402
 
 EVALUATION_SEEDS = (0, 1)
-MEASURED = ("rank_correlation", "plan_ms", "samples", "iterations")  # what a row keeps
+MEASURED = ("rank_correlation", "plan_ms", "same_search_returns",  # of result.json, in a row
+            "samples", "iterations")
 HEADS = ("seeds", "MPPI", "student", "kept, evaluation seeds 0 / 1", "least kept",
-         "planning wins, expert / student", "speed-up, one core",
+         "planning wins, expert / student", "the same search with the expert: kept",
+         "speed-up, one core: over expert / over that",
          "rank correlation of G, H = 0 / last", "minutes")
 FLAGS = {"samples": "plan-samples", "iterations": "plan-iterations", "num_agents": "num-agents"}
 
@@ -36,7 +38,7 @@ def distil_student(task, seed, preset, settings, students):
                "expert_mean": found["expert_return_mean"], "rank_q": found["rank_correlation"],
                "rank_return": found["rank_correlation_returns"][-1],
                "expert_returns": np.round(found["expert_returns"], 3).tolist(),
-               "policy_returns": np.round(found["policy_returns"] or [], 3).tolist(),
+               "policy_returns": np.round(found.get("policy_returns", []), 3).tolist(),
                "minutes": found["seconds"] / 60,
                "ranks": {k: v for k, v in found.items() if k.startswith(MEASURED)}}
 
@@ -47,10 +49,11 @@ def mean_and_spread(values, spread):
     return f"{values.mean():.0f}" + (f" ± {spread(values):.0f}" if len(values) > 1 else "")
 
 
-def kept(rows):
-    """The students' mean return by their expert's, a ratio of means over rows; NaN: nothing."""
-    found = fac.return_kept(*(np.mean([np.mean(json.loads(row[key])) for row in rows])
-                              for key in ("returns", "expert_returns")))
+def kept(rows, returns=lambda row: json.loads(row["returns"])):
+    """The mean of `returns`, the student's, by the expert's, a ratio of means over rows; NaN:
+    nothing."""
+    found = fac.return_kept(*(np.mean([np.mean(of(row)) for row in rows]) for of in (
+        returns, lambda row: json.loads(row["expert_returns"]))))
     return np.nan if found is None else found
 
 
@@ -73,7 +76,9 @@ def cells(rows):
     if not all(rows[seed] for seed in EVALUATION_SEEDS):
         return ["-"] * len(HEADS)
     first, students = rows[0], sum(rows.values(), [])
-    faster = measured(first, lambda x: x["plan_ms_expert"] / x["plan_ms_student_in_process"])
+    same = [row for row in students if "same_search_returns" in json.loads(row["ranks"])]
+    faster = (measured(of, lambda x, key=key: x[key] / x["plan_ms_student_in_process"])
+              for key, of in (("plan_ms_expert", first), ("plan_ms_same_search", same)) if of)
     ranks = (measured(first, lambda x, h=h: x["rank_correlation_returns"][h]) for h in (0, -1))
     budget = "{samples} x {iterations}".format_map(json.loads(first[0]["ranks"]))
     returns = [float(row["return_mean"]) for row in first]
@@ -82,7 +87,8 @@ def cells(rows):
             f"{min(kept([row]) for row in students):.2f}",
             "-" if "[]" in (row["policy_returns"] for row in students) else " / ".join(
                 planning_wins(rows, key) for key in ("expert_returns", "returns")),
-            f"{faster:.1f}",
+            f"{kept(same, lambda row: json.loads(row['ranks'])['same_search_returns']):.2f}"
+            if same else "-", " / ".join(f"{x:.1f}" for x in faster),
             " / ".join(f"{x:.2f}" for x in ranks),
             f"{np.mean([float(row['minutes']) for row in first]):.0f}"]
 

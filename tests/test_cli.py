@@ -910,7 +910,9 @@ def test_what_is_kept_is_the_student_s_return_by_the_expert_s(monkeypatch):
     monkeypatch.setattr(fac, "evaluate", lambda *_: {"returns": [4.0, 8.0]})
     args = SimpleNamespace(task="x", episodes=2, eval_seed=0, workers=0, evaluate_expert=False)
     planned = SimpleNamespace(has_policy=False), fac.PlannerConfig()
-    found = fac.evaluate_both(planned, planned, ([9.0, 15.0, 99.0], {}), args)
+    monkeypatch.setattr(fac, "recorded_returns", lambda path, model, *_: (
+        [9.0, 15.0, 99.0] if model is planned[0] else [], {}))
+    found = fac.evaluate_both(planned, (None, planned[1]), "expert.npz", args)
     assert (found["kept"], found["expert_return_std"], found["student_return_std"]) == (0.5, 3, 2)
     assert fac.return_kept(3, 0) is fac.return_kept(3, -1) is None  # nothing to keep
 
@@ -1025,8 +1027,9 @@ def test_recorded_returns_stand_for_the_expert_in_distill(tmp_path, files, no_pl
     assert fac.main([str(a) for a in (*arguments, "--evaluate-expert", "--json")]) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert result["expert_recorded"] is False and result["expert_returns"] == [123.0]
-    assert labels == ["evaluating the student", "evaluating the expert",
-                      "evaluating its policy alone"]
+    assert labels == ["evaluating the expert", "evaluating the student",
+                      "evaluating its policy alone",
+                      "evaluating expert, searching like its student"]
 
 
 def test_expert_and_student_plan_over_the_horizon_they_were_made_for(tmp_path, files, monkeypatch,
@@ -1045,7 +1048,7 @@ def test_expert_and_student_plan_over_the_horizon_they_were_made_for(tmp_path, f
     assert timed[:2] == [3, 2]
     evaluation = ["evaluate", "--model", str(tmp_path / "student.npz")]
     assert fac.main(evaluation) == fac.main([*evaluation, "--horizon", "0"]) == 0
-    assert seen == [2, 3, 3, 2, 0]  # student, expert, its policy; evaluate twice
+    assert seen == [3, 2, 3, 3, 2, 0]  # expert, student, expert in two more ways; evaluate twice
 
 
 def test_a_terminal_without_plus_minus_gets_its_table(tmp_path, files):

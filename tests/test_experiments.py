@@ -1012,8 +1012,9 @@ def write_student_rows(path, policy=(90.0, 110.0)):
                  "expert_returns": [200.0, 50.0], "policy_returns": policy, "minutes": 6.0,
                  "evaluation_seed": evaluation_seed, "ranks": {
                      "rank_correlation_returns": [0.9, 0.5], "plan_ms_expert": 9.0,
-                     "plan_ms_student_in_process": 2.0, "samples": samples,
-                     "iterations": iterations}}
+                     "plan_ms_student_in_process": 2.0, "samples": samples, "iterations":
+                     iterations, **({"plan_ms_same_search": 5.0, "same_search_returns": [
+                         210.0, 20.0]} if samples == 32 else {})}}
                 for evaluation_seed, returns in ((1, second), (0, first))]
 
     own = {"steps": 9, "num_agents": 6}
@@ -1034,7 +1035,9 @@ def test_the_table_of_students_has_a_line_for_each_preset_and_each_chosen_budget
     assert (own["task"], own["N"], own["MPPI"]) == ("walker-run", "6", "32 x 3")
     assert own["expert"] == "125 ± 75" and own["its policy alone"] == "100 ± 10"  # over episodes
     assert own["student"] == "88 ± 18"  # 100 and 75: over seeds, n - 1
-    assert own["speed-up, one core"] == "4.5" and (own["seeds"], own["minutes"]) == ("2", "6")
+    assert own["speed-up, one core: over expert / over that"] == "4.5 / 2.5"
+    assert own["the same search with the expert: kept"] == "0.92"  # 115 of 125
+    assert (own["seeds"], own["minutes"]) == ("2", "6")
     assert own["kept, evaluation seeds 0 / 1"] == "0.70 / 0.90"
     assert own["least kept"] == "0.60"  # of each seed's two: 0.80, 0.60; 1.00, 0.80
     # 110, -60 twice; each episode's mean over the two seeds: 70, -95, 135, -110
@@ -1043,6 +1046,8 @@ def test_the_table_of_students_has_a_line_for_each_preset_and_each_chosen_budget
     assert own["authors' logs: 100% TD-MPC / Fac-TDMPC"] == "836 / 809"
     assert (paper["task"], paper["seeds"], paper["MPPI"]) == ("walker-run, paper", "1", "512 x 6")
     assert paper["kept, evaluation seeds 0 / 1"] == "0.40 / 0.32"
+    assert paper["speed-up, one core: over expert / over that"] == "4.5"
+    assert paper["the same search with the expert: kept"] == "-"
     assert chosen["task"] == "walker-run, samples 512, iterations 6"
     assert list(result) == [own["task"], paper["task"], chosen["task"]]
     assert result["walker-run"]["MPPI"] == "32 x 3"
@@ -1060,8 +1065,8 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
             f"rank_correlation_{key}": [0.25] * 4
             for key in ("by_step", "returns", "returns_training", "returns_se")}})
     monkeypatch.setattr(fac, "time_both", lambda *_: {
-        "plan_ms_expert": 1.0, "plan_ms_student_in_process": 1.0, "plan_ms_student": 1.0,
-        "plan_workers": 0})
+        "plan_workers": 0, **{f"plan_ms_{who}": 1.0 for who in (
+            "expert", "policy", "same_search", "student_in_process", "student")}})
     monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: rows.extend(
         row for run in runs for row in experiments.attempt(function, run, os.getpid())))
     for samples in ("8", "4"):  # another budget: the student is there
@@ -1076,17 +1081,17 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
     model, header = fac.load_model(tmp_path / "reacher-easy-3" / "student.npz")
     assert (header["seed"], model.config.num_agents, header["distill"]["steps"]) == (3, 3, 1)
     expert, _ = fac.load_model(fac.data_file("reacher-easy", "expert.npz"))
-    own = fac.PlannerConfig()
+    own, students_own = (fac.PlannerConfig(**of) for of in ({}, fac.made_for(header, "")))
     for row in rows[2:]:
-        seeds, expected = fac.episode_seeds(int(row["evaluation_seed"]), 1), {}
+        seeds = fac.episode_seeds(int(row["evaluation_seed"]), 1)
+        found = {**row, "same_search_returns": json.dumps(
+            json.loads(row["ranks"])["same_search_returns"])}
         for key, who, planning in (
-                ("returns", model, fac.PlannerConfig(**fac.made_for(header, "student.npz"))),
-                ("expert_returns", expert, own), ("policy_returns", expert,
-                                                  fac.dataclasses.replace(own, prior="policy",
-                                                                          iterations=0))):
-            expected[key] = fac.play(who, "reacher-easy", planning, seeds, 0)[2].sum(1)
-        for key, returns in expected.items():
-            np.testing.assert_allclose(json.loads(row[key]), returns, atol=1e-3)
+                ("returns", model, students_own), ("expert_returns", expert, own),
+                ("policy_returns", expert, dataclasses.replace(own, prior="policy", iterations=0)),
+                ("same_search_returns", expert, dataclasses.replace(students_own, pi_trajs=0))):
+            returns = fac.play(who, "reacher-easy", planning, seeds, 0)[2].sum(1)
+            np.testing.assert_allclose(json.loads(found[key]), returns, atol=1e-3)
         assert json.loads(row["ranks"])["rank_correlation_returns"] == [0.25] * 4
         assert row["versions"] == experiments.versions()
         assert f"numpy {np.__version__}" in row["versions"] and "mujoco 3" in row["versions"]
