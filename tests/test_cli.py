@@ -412,6 +412,10 @@ def test_distill_prints_json_and_a_table(distilled):
     assert "horizon 3 and 1" in table and "128 x 4" in table and "16 x 1" in table
     policy = np.mean(result["policy_returns"])
     assert len(result["policy_returns"]) == 1 and f"{policy:.0f} ± 0" in table
+    (line,) = [line for line in table.splitlines() if "searching like its student" in line]
+    ms, experts = result["plan_ms_same_search"], result["plan_ms_expert"]
+    assert line.split()[-8:] == ["16", "x", "1", f"{result['same_search_return_mean']:.0f}", "±",
+                                 "0", f"{ms:.1f}", f"{experts / ms:.1f}"]
     header, _ = fac.read_npz(folder / "student.npz", ("student",))
     gain, error = result["wide_search_gain"]
     width = (fac.WIDE_SEARCH if gain > 2 * error else fac.STUDENT_PLANNING)["max_std"]
@@ -915,6 +919,19 @@ def test_what_is_kept_is_the_student_s_return_by_the_expert_s(monkeypatch):
     found = fac.evaluate_both(planned, (None, planned[1]), "expert.npz", args)
     assert (found["kept"], found["expert_return_std"], found["student_return_std"]) == (0.5, 3, 2)
     assert fac.return_kept(3, 0) is fac.return_kept(3, -1) is None  # nothing to keep
+
+
+def test_distill_compares_with_the_expert_s_policy_and_with_it_in_the_student_s_search():
+    own = fac.PlannerConfig(horizon=2, discount=0.5)
+    expert = random_model(1, policy=True), own
+    around = fac.PlannerConfig(**fac.STUDENT_PLANNING, elites=5, horizon=1)
+    found = fac.compared(expert, (None, around))
+    assert [*found] == ["expert", "student", "policy", "same_search"]
+    model, same = found["same_search"]
+    assert model is expert[0]  # its own horizon and discount; a student has no proposals
+    assert same == fac.dataclasses.replace(around, horizon=2, discount=0.5, pi_trajs=0)
+    assert [*fac.compared(expert, (None, own))] == ["expert", "student", "policy"]
+    assert [*fac.compared((random_model(1), own), (None, own))] == ["expert", "student"]
 
 
 def test_what_stops_several_workers_is_said_once(tmp_path, distilled):
