@@ -698,7 +698,6 @@ class AgentPlanner:
 
 
 # ==== Part II: additions and engineering ==============================================
-#
 # A first reader is done: what follows is what this project adds to the paper, the same in less
 # time and in processes, and what a program needs around it.
 

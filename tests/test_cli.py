@@ -998,7 +998,7 @@ def test_models_plan_with_the_discount_they_were_trained_with(tmp_path, files, c
             return
         for command in (arguments, *evaluations, [*evaluations[0], "--discount", "0.5"]):
             assert fac.main([str(a) for a in command]) == 0
-    assert seen == [0.9] * 5 + [0.5] and evaluate is fac.evaluate  # one the policy's, alone
+    assert seen == [0.9] * 6 + [0.5] and evaluate is fac.evaluate  # four in distill
 
 
 def test_recorded_returns_stand_for_the_expert_in_distill(tmp_path, files, no_plots, monkeypatch,
