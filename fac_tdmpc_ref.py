@@ -2496,18 +2496,18 @@ def report(result, plannings):
     print(f"\n{result['task']}, {result['episodes']} episodes, evaluation seed "
           f"{result['eval_seed']}, horizon {' and '.join(map(str, dict.fromkeys(horizons)))}\n")
     rows = [("", "MPPI", "return", "ms a decision", "speed-up")]
-    for name, budget, who in (
-            (f"expert ({source}), one process{over[0]}", budgets[0], "expert"),
-            (COMPARED["policy"], "0", "policy"),
-            (COMPARED["same_search"], budgets[1], "same_search"),
-            (f"student, N = {result['num_agents']}, one process{over[1]}", budgets[1], "student"),
-            (f"student, workers beside: {result['plan_workers']}", "", "workers")):
-        found, about = result.get(f"{who}_returns"), {
-            "student": "student_in_process", "workers": "student"}.get(who, who)
-        if found or who == "workers" and result["plan_workers"]:
-            ms = result[f"plan_ms_{about}"]
-            rows.append((name, budget, f"{np.mean(found):.0f} ± {np.std(found):.0f}" if found else
-                         "the same plans", f"{ms:.1f}", f"{result['plan_ms_expert'] / ms:.1f}"))
+    for name, budget, who, timed in (
+            (f"expert ({source}), one process{over[0]}", budgets[0], "expert", "expert"),
+            (COMPARED["policy"], "0", "policy", "policy"),
+            (COMPARED["same_search"], budgets[1], "same_search", "same_search"),
+            (f"student, N = {result['num_agents']}, one process{over[1]}", budgets[1], "student",
+             "student_in_process"),
+            (f"student, workers beside: {result['plan_workers']}", "", "", "student"),
+            )[:5 if result["plan_workers"] else 4]:
+        if ms := result.get(f"plan_ms_{timed}"):  # or it isn't `compared`
+            rows.append((name, budget, f"{result[f'{who}_return_mean']:.0f} ± "
+                         f"{result[f'{who}_return_std']:.0f}" if who else "the same plans",
+                         f"{ms:.1f}", f"{result['plan_ms_expert'] / ms:.1f}"))
     print_table(rows)
     q, g, known, error = (result[f"rank_correlation_{key}"] for key in (
         "by_step", "returns", "returns_training", "returns_se"))

@@ -57,6 +57,11 @@ def kept(rows, returns=lambda row: json.loads(row["returns"])):
     return np.nan if found is None else found
 
 
+def same_search(row):
+    """A row's returns of the expert in its student's search; None where it wasn't made."""
+    return json.loads(row["ranks"]).get("same_search_returns")
+
+
 def planning_wins(rows, key):
     """What planning with a model, whose returns are `key`'s, wins over the expert's policy in the
     same episodes: its mean ± standard error over episodes. rows: {evaluation seed: rows by seed}"""
@@ -76,7 +81,7 @@ def cells(rows):
     if not all(rows[seed] for seed in EVALUATION_SEEDS):
         return ["-"] * len(HEADS)
     first, students = rows[0], sum(rows.values(), [])
-    same = [row for row in students if "same_search_returns" in json.loads(row["ranks"])]
+    same = [row for row in students if same_search(row)]
     faster = (measured(of, lambda x, key=key: x[key] / x["plan_ms_student_in_process"])
               for key, of in (("plan_ms_expert", first), ("plan_ms_same_search", same)) if of)
     ranks = (measured(first, lambda x, h=h: x["rank_correlation_returns"][h]) for h in (0, -1))
@@ -87,8 +92,8 @@ def cells(rows):
             f"{min(kept([row]) for row in students):.2f}",
             "-" if "[]" in (row["policy_returns"] for row in students) else " / ".join(
                 planning_wins(rows, key) for key in ("expert_returns", "returns")),
-            f"{kept(same, lambda row: json.loads(row['ranks'])['same_search_returns']):.2f}"
-            if same else "-", " / ".join(f"{x:.1f}" for x in faster),
+            f"{kept(same, same_search):.2f}" if same else "-",
+            " / ".join(f"{x:.1f}" for x in faster),
             " / ".join(f"{x:.2f}" for x in ranks),
             f"{np.mean([float(row['minutes']) for row in first]):.0f}"]
 

@@ -1084,14 +1084,15 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
     own, students_own = (fac.PlannerConfig(**of) for of in ({}, fac.made_for(header, "")))
     for row in rows[2:]:
         seeds = fac.episode_seeds(int(row["evaluation_seed"]), 1)
-        found = {**row, "same_search_returns": json.dumps(
-            json.loads(row["ranks"])["same_search_returns"])}
-        for key, who, planning in (
-                ("returns", model, students_own), ("expert_returns", expert, own),
-                ("policy_returns", expert, dataclasses.replace(own, prior="policy", iterations=0)),
-                ("same_search_returns", expert, dataclasses.replace(students_own, pi_trajs=0))):
+        for found, who, planning in (
+                (json.loads(row["returns"]), model, students_own),
+                (json.loads(row["expert_returns"]), expert, own),
+                (json.loads(row["policy_returns"]), expert,
+                 dataclasses.replace(own, prior="policy", iterations=0)),
+                (students.same_search(row), expert,
+                 dataclasses.replace(students_own, pi_trajs=0))):
             returns = fac.play(who, "reacher-easy", planning, seeds, 0)[2].sum(1)
-            np.testing.assert_allclose(json.loads(found[key]), returns, atol=1e-3)
+            np.testing.assert_allclose(found, returns, atol=1e-3)
         assert json.loads(row["ranks"])["rank_correlation_returns"] == [0.25] * 4
         assert row["versions"] == experiments.versions()
         assert f"numpy {np.__version__}" in row["versions"] and "mujoco 3" in row["versions"]
