@@ -761,10 +761,11 @@ def report_figure8(_, path, figures):
 
 
 def report_students(_, path, figures):
-    """The README's main table: students as `distill` makes them."""
+    """Students as `distill` makes them: the README's main table, all of it, the same search."""
     rows = [row for own in settled(path, VARIED["students"]).values() for row in own]
-    theirs = {task: f"{found[1]} / {found[0]}" for task, found in AUTHORS.items()}
-    return students.table(rows, theirs)
+    result, text = students.table(rows, {
+        task: f"{found[1]} / {found[0]}" for task, found in AUTHORS.items()})
+    return result, "\n".join([students.readme_table(result), text, students.search_table(rows)])
 
 
 REPORT_HEAD = """# The paper's figures, here

@@ -1,4 +1,4 @@
-"""Students as `distill` makes them, and the README's main table: `experiments.py students`."""
+"""Students as `distill` makes them, and their tables: `experiments.py students`."""
 import json
 import sys
 from pathlib import Path
@@ -12,9 +12,10 @@ from tables import deviation, markdown, of_returns  # noqa: E402
 EVALUATION_SEEDS = (0, 1)
 MEASURED = ("rank_correlation", "plan_ms", "same_search_returns",  # of result.json, in a row
             "samples", "iterations")
-HEADS = ("seeds", "MPPI", "student", "kept, evaluation seeds 0 / 1", "least kept",
-         "planning wins, expert / student", "the same search with the expert: kept",
-         "speed-up, one core: over expert / over that",
+KEPT, WINS = "kept, evaluation seeds 0 / 1", "planning wins, expert / student"
+FASTER = "speed-up, one core: over expert / the same search"
+HEADS = ("seeds", "MPPI", "student", KEPT, "least kept", WINS,
+         "the same search with the expert: kept", FASTER,
          "rank correlation of G, H = 0 / last", "minutes")
 FLAGS = {"samples": "plan-samples", "iterations": "plan-iterations", "num_agents": "num-agents"}
 
@@ -49,25 +50,24 @@ def mean_and_spread(values, spread):
     return f"{values.mean():.0f}" + (f" ± {spread(values):.0f}" if len(values) > 1 else "")
 
 
-def kept(rows, returns=lambda row: json.loads(row["returns"])):
-    """The mean of `returns`, the student's, by the expert's, a ratio of means over rows; NaN:
-    nothing."""
-    found = fac.return_kept(*(np.mean([np.mean(of(row)) for row in rows]) for of in (
-        returns, lambda row: json.loads(row["expert_returns"]))))
+def returns(row, key="returns"):
+    """A row's returns: the student's, or what else `distill` compares; []: not there."""
+    return json.loads(row[key]) if key in row else json.loads(row["ranks"]).get(key, [])
+
+
+def kept(rows, key="returns"):
+    """The mean of these returns by the expert's, a ratio of means over rows; NaN: nothing."""
+    found = fac.return_kept(*(np.mean([np.mean(returns(row, of)) for row in rows])
+                              for of in (key, "expert_returns")))
     return np.nan if found is None else found
 
 
-def same_search(row):
-    """A row's returns of the expert in its student's search; None where it wasn't made."""
-    return json.loads(row["ranks"]).get("same_search_returns")
-
-
-def planning_wins(rows, key):
-    """What planning with a model, whose returns are `key`'s, wins over the expert's policy in the
-    same episodes: its mean ± standard error over episodes. rows: {evaluation seed: rows by seed}"""
+def wins(rows, key="returns", over="policy_returns"):
+    """What returns are above others in the same episodes: mean ± standard error over episodes, of
+    means over seeds. rows: {evaluation seed: rows by seed}"""
     found = np.concatenate([
-        np.mean([np.subtract(json.loads(row[key]), json.loads(row["policy_returns"]))
-                 for row in rows[seed]], 0) for seed in EVALUATION_SEEDS])
+        np.mean([np.subtract(returns(row, key), returns(row, over)) for row in rows[seed]], 0)
+        for seed in EVALUATION_SEEDS])
     return f"{found.mean():.0f} ± {found.std(ddof=1) / len(found) ** 0.5:.0f}"
 
 
@@ -81,18 +81,18 @@ def cells(rows):
     if not all(rows[seed] for seed in EVALUATION_SEEDS):
         return ["-"] * len(HEADS)
     first, students = rows[0], sum(rows.values(), [])
-    same = [row for row in students if same_search(row)]
+    same = [row for row in students if returns(row, "same_search_returns")]
     faster = (measured(of, lambda x, key=key: x[key] / x["plan_ms_student_in_process"])
               for key, of in (("plan_ms_expert", first), ("plan_ms_same_search", same)) if of)
     ranks = (measured(first, lambda x, h=h: x["rank_correlation_returns"][h]) for h in (0, -1))
     budget = "{samples} x {iterations}".format_map(json.loads(first[0]["ranks"]))
-    returns = [float(row["return_mean"]) for row in first]
-    return [len(first), budget, mean_and_spread(returns, deviation),
+    means = [float(row["return_mean"]) for row in first]
+    return [len(first), budget, mean_and_spread(means, deviation),
             " / ".join(f"{kept(rows[seed]):.2f}" for seed in EVALUATION_SEEDS),
             f"{min(kept([row]) for row in students):.2f}",
-            "-" if "[]" in (row["policy_returns"] for row in students) else " / ".join(
-                planning_wins(rows, key) for key in ("expert_returns", "returns")),
-            f"{kept(same, same_search):.2f}" if same else "-",
+            " / ".join(wins(rows, key) for key in ("expert_returns", "returns"))
+            if all(returns(row, "policy_returns") for row in students) else "-",
+            f"{kept(same, 'same_search_returns'):.2f}" if same else "-",
             " / ".join(f"{x:.1f}" for x in faster),
             " / ".join(f"{x:.2f}" for x in ranks),
             f"{np.mean([float(row['minutes']) for row in first]):.0f}"]
@@ -106,19 +106,51 @@ def line_of(row):
         f"{name} {about[name]}" for name in ("samples", "iterations") if name in about)])
 
 
-def table(rows, authors):
-    """The README's main table, {line: {head: cell}}, and Markdown. authors: {task: text}."""
-    runs, lines, result = {}, [], {}
+def by_line(rows):
+    """{line: {evaluation seed: rows by seed}}."""
+    found = {}
     for row in rows:
-        runs.setdefault(line_of(row), {seed: [] for seed in EVALUATION_SEEDS})[
+        found.setdefault(line_of(row), {seed: [] for seed in EVALUATION_SEEDS})[
             int(row["evaluation_seed"])].append(row)
-    for line, found in runs.items():
+    return found
+
+
+def table(rows, authors):
+    """All lines, {line: {head: cell}}, and Markdown. authors: {task: text}."""
+    result, last = {}, "authors' logs: 100% TD-MPC / Fac-TDMPC"
+    for line, found in by_line(rows).items():
         row = sum(found.values(), [])[0]
-        policy = json.loads(row["policy_returns"])
-        result[line] = dict(zip(HEADS, cells(found)))
-        lines.append([line, json.loads(row["settings"])["num_agents"],
-                      mean_and_spread(json.loads(row["expert_returns"]), np.std),
-                      mean_and_spread(policy, np.std) if policy else "-",
-                      *result[line].values(), authors.get(row["task"], "-")])
-    return result, markdown(["task", "N", "expert", "its policy alone", *HEADS,
-                             "authors' logs: 100% TD-MPC / Fac-TDMPC"], lines)
+        policy = returns(row, "policy_returns")
+        result[line] = {
+            "task": line, "N": json.loads(row["settings"])["num_agents"],
+            "expert": mean_and_spread(returns(row, "expert_returns"), np.std),
+            "its policy alone": mean_and_spread(policy, np.std) if policy else "-",
+            **dict(zip(HEADS, cells(found))), last: authors.get(row["task"], "-")}
+    return result, markdown(["task", "N", "expert", "its policy alone", *HEADS, last],
+                            [found.values() for found in result.values()])
+
+
+def readme_table(found):
+    """The README's, of `table`'s lines: each task's default, and what its plain preset keeps."""
+    means, others = ("expert", "its policy alone", "student"), (KEPT, WINS, FASTER)
+    return markdown(["task", "N", *means, *others, "`plain` keeps"], [
+        [task, own["N"], *(own[head].split(" ±")[0] for head in means),
+         *(own[head] for head in others), found.get(f"{task}, plain", {}).get(KEPT, "-")]
+        for task, own in found.items() if "," not in task])
+
+
+def search_table(rows):
+    """The expert searching like its student, beside both: mean returns over seeds and episodes of
+    both evaluation seeds, milliseconds of a decision in one process."""
+    lines = []
+    for line, found in by_line(rows).items():
+        own = sum(found.values(), [])
+        if all(found.values()) and all(returns(row, "same_search_returns") for row in own):
+            lines.append([
+                line, *(f"{np.mean([np.mean(returns(row, key)) for row in own]):.0f}" for key in (
+                    "expert_returns", "policy_returns", "same_search_returns", "returns")),
+                wins(found, over="same_search_returns"),
+                *(f"{measured(own, lambda x, who=who: x[f'plan_ms_{who}']):.1f}" for who in (
+                    "expert", "policy", "same_search", "student_in_process"))])
+    who = "the expert", "its policy alone", "the same search", "student"
+    return markdown(["task", *who, "student - the same search", *(f"ms: {x}" for x in who)], lines)

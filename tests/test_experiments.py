@@ -1012,9 +1012,10 @@ def write_student_rows(path, policy=(90.0, 110.0)):
                  "expert_returns": [200.0, 50.0], "policy_returns": policy, "minutes": 6.0,
                  "evaluation_seed": evaluation_seed, "ranks": {
                      "rank_correlation_returns": [0.9, 0.5], "plan_ms_expert": 9.0,
-                     "plan_ms_student_in_process": 2.0, "samples": samples, "iterations":
-                     iterations, **({"plan_ms_same_search": 5.0, "same_search_returns": [
-                         210.0, 20.0]} if samples == 32 else {})}}
+                     "plan_ms_student_in_process": 2.0, "plan_ms_policy": 1.0, "samples": samples,
+                     "iterations": iterations, **({
+                         "plan_ms_same_search": 5.0, "same_search_returns": [210.0, 20.0]}
+                         if samples == 32 else {})}}
                 for evaluation_seed, returns in ((1, second), (0, first))]
 
     own = {"steps": 9, "num_agents": 6}
@@ -1029,13 +1030,23 @@ def write_student_rows(path, policy=(90.0, 110.0)):
 def test_the_table_of_students_has_a_line_for_each_preset_and_each_chosen_budget(tmp_path):
     write_student_rows(tmp_path / "students.csv")
     result, text = experiments.report_students("students", tmp_path / "students.csv", tmp_path)
-    heads, _, *lines = (
-        [part.strip() for part in line.split("|")[1:-1]] for line in text.splitlines())
-    own, paper, chosen = (dict(zip(heads, line)) for line in lines)
+    tables = []
+    for table in text.split("\n\n"):
+        heads, _, *lines = ([part.strip() for part in line.split("|")[1:-1]]
+                            for line in table.splitlines())
+        tables.append([dict(zip(heads, line)) for line in lines])
+    (short,), (own, paper, chosen), (search,) = tables
+    alike = students.KEPT, students.WINS, students.FASTER
+    assert short == {**{head: own[head] for head in alike}, "task": "walker-run", "N": "6",
+                     "expert": "125", "its policy alone": "100", "student": "88",
+                     "`plain` keeps": "-"}
+    # over both evaluation seeds: 100, 75, 125, 100; students of each episode less 210 and 20
+    assert [*search.values()] == ["walker-run", "125", "100", "115", "100", "-15 ± 14", "9.0",
+                                  "1.0", "5.0", "2.0"]
     assert (own["task"], own["N"], own["MPPI"]) == ("walker-run", "6", "32 x 3")
     assert own["expert"] == "125 ± 75" and own["its policy alone"] == "100 ± 10"  # over episodes
     assert own["student"] == "88 ± 18"  # 100 and 75: over seeds, n - 1
-    assert own["speed-up, one core: over expert / over that"] == "4.5 / 2.5"
+    assert own[students.FASTER] == "4.5 / 2.5"
     assert own["the same search with the expert: kept"] == "0.92"  # 115 of 125
     assert (own["seeds"], own["minutes"]) == ("2", "6")
     assert own["kept, evaluation seeds 0 / 1"] == "0.70 / 0.90"
@@ -1046,7 +1057,7 @@ def test_the_table_of_students_has_a_line_for_each_preset_and_each_chosen_budget
     assert own["authors' logs: 100% TD-MPC / Fac-TDMPC"] == "836 / 809"
     assert (paper["task"], paper["seeds"], paper["MPPI"]) == ("walker-run, paper", "1", "512 x 6")
     assert paper["kept, evaluation seeds 0 / 1"] == "0.40 / 0.32"
-    assert paper["speed-up, one core: over expert / over that"] == "4.5"
+    assert paper[students.FASTER] == "4.5"
     assert paper["the same search with the expert: kept"] == "-"
     assert chosen["task"] == "walker-run, samples 512, iterations 6"
     assert list(result) == [own["task"], paper["task"], chosen["task"]]
@@ -1054,6 +1065,14 @@ def test_the_table_of_students_has_a_line_for_each_preset_and_each_chosen_budget
     write_student_rows(tmp_path / "none.csv", policy=())  # an expert without a policy
     _, text = experiments.report_students("students", tmp_path / "none.csv", tmp_path)
     assert "| 125 ± 75 | - | 2 | 32 x 3 | 88 ± 18 |" in text
+
+
+def test_the_readmes_hold_the_tables_that_the_rows_give():
+    results = ROOT / "data" / "results"
+    _, text = experiments.report_students("students", results / "students.csv", None)
+    short, _, search = text.split("\n\n")
+    assert short in (ROOT / "README.md").read_text(encoding="utf-8")
+    assert search in (results / "README.md").read_text(encoding="utf-8")
 
 
 def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkeypatch):
@@ -1089,7 +1108,7 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
                 (json.loads(row["expert_returns"]), expert, own),
                 (json.loads(row["policy_returns"]), expert,
                  dataclasses.replace(own, prior="policy", iterations=0)),
-                (students.same_search(row), expert,
+                (students.returns(row, "same_search_returns"), expert,
                  dataclasses.replace(students_own, pi_trajs=0))):
             returns = fac.play(who, "reacher-easy", planning, seeds, 0)[2].sum(1)
             np.testing.assert_allclose(found, returns, atol=1e-3)
