@@ -765,17 +765,19 @@ def report_students(_, path, figures):
     rows = [row for own in settled(path, VARIED["students"]).values() for row in own]
     result, text = students.table(rows, {
         task: f"{found[1]} / {found[0]}" for task, found in AUTHORS.items()})
-    return result, "\n".join([students.readme_table(result), text, students.search_table(rows)])
+    return result, "\n".join([students.readme_table(rows, result), text,
+                              students.search_table(rows)])
 
 
 REPORT_HEAD = """# The paper's figures, here
 
 Written by `python data/experiments.py report` from the CSVs beside it; README.md says what they
-show. Returns: mean ± sample deviation (n - 1) over seeds (their number; one without), then the rank
-correlation of G; every run's settings are in its CSV. Figure 12's ratio is one of means. In Figure
-8 what is kept is of the undisturbed return, mean over joints, with where 95% of a bootstrap over
-episodes and joints lie, bold without 0 in it; where a row holds no episode's return, its mean has
-the luck that its deviation allows, the same for all joints of a model. '10% TD-MPC' has hidden
+show. Returns: mean ± sample deviation (n - 1) over seeds (their number; one without), experts' and
+their policies' over episodes of one evaluation seed; what planning wins ± standard error; then the
+rank correlation of G; every run's settings are in its CSV. Figure 12's ratio is one of means. In
+Figure 8 what is kept is of the undisturbed return, mean over joints, with where 95% of a bootstrap
+over episodes and joints lie, bold without 0 in it; where a row holds no episode's return, its mean
+has the luck that its deviation allows, the same for all joints of a model. '10% TD-MPC' has hidden
 layers of 66 (B.2), which with Table 2's latents of 50 is 3% of the weights behind the encoder; six
 agents have 26%. One agent's layers are as wide as its expert's, N agents' an Nth of that. Figure
 13: latents of 50 an agent, so 50 N in all.

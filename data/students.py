@@ -130,27 +130,36 @@ def table(rows, authors):
                             [found.values() for found in result.values()])
 
 
-def readme_table(found):
-    """The README's, of `table`'s lines: each task's default, and what its plain preset keeps."""
-    means, others = ("expert", "its policy alone", "student"), (KEPT, WINS, FASTER)
-    return markdown(["task", "N", *means, *others, "`plain` keeps"], [
-        [task, own["N"], *(own[head].split(" ±")[0] for head in means),
-         *(own[head] for head in others), found.get(f"{task}, plain", {}).get(KEPT, "-")]
-        for task, own in found.items() if "," not in task])
+def overall(rows, key="returns"):
+    """The mean of these returns over seeds and episodes of both evaluation seeds."""
+    return f"{np.mean([np.mean(returns(row, key)) for row in rows]):.0f}"
+
+
+def readme_table(rows, result):
+    """The README's: each task's default, and what its plain preset keeps. result: `table`'s."""
+    lines = []
+    for task, found in by_line(rows).items():
+        own = sum(found.values(), [])
+        if "," not in task and all(returns(row, "policy_returns") for row in own):
+            lines.append([task, result[task]["N"], *(overall(own, key) for key in (
+                "expert_returns", "policy_returns", "returns")), *(
+                    result[task][head] for head in (KEPT, WINS, FASTER)),
+                result.get(f"{task}, plain", {}).get(KEPT, "-")])
+    return markdown(["task", "N", "expert", "its policy alone", "student", KEPT, WINS, FASTER,
+                     "`--preset plain` keeps"], lines)
 
 
 def search_table(rows):
-    """The expert searching like its student, beside both: mean returns over seeds and episodes of
-    both evaluation seeds, milliseconds of a decision in one process."""
-    lines = []
+    """The expert searching like its student, beside both: mean returns, and milliseconds of a
+    decision in one process."""
+    keys = "expert_returns", "policy_returns", "same_search_returns", "returns"
+    timed = "expert", "policy", "same_search", "student_in_process"
+    heads, lines = ("the expert", "its policy alone", "the same search", "student"), []
     for line, found in by_line(rows).items():
         own = sum(found.values(), [])
-        if all(found.values()) and all(returns(row, "same_search_returns") for row in own):
-            lines.append([
-                line, *(f"{np.mean([np.mean(returns(row, key)) for row in own]):.0f}" for key in (
-                    "expert_returns", "policy_returns", "same_search_returns", "returns")),
-                wins(found, over="same_search_returns"),
-                *(f"{measured(own, lambda x, who=who: x[f'plan_ms_{who}']):.1f}" for who in (
-                    "expert", "policy", "same_search", "student_in_process"))])
-    who = "the expert", "its policy alone", "the same search", "student"
-    return markdown(["task", *who, "student - the same search", *(f"ms: {x}" for x in who)], lines)
+        if all(found.values()) and all(returns(row, key) for row in own for key in keys):
+            ms = [measured(own, lambda x, key=f"plan_ms_{who}": x[key]) for who in timed]
+            lines.append([line, *(overall(own, key) for key in keys),
+                          wins(found, over="same_search_returns"), *(f"{x:.1f}" for x in ms)])
+    return markdown(["task", *heads, "student - the same search", *(f"ms: {x}" for x in heads)],
+                    lines)

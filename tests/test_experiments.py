@@ -1038,8 +1038,8 @@ def test_the_table_of_students_has_a_line_for_each_preset_and_each_chosen_budget
     (short,), (own, paper, chosen), (search,) = tables
     alike = students.KEPT, students.WINS, students.FASTER
     assert short == {**{head: own[head] for head in alike}, "task": "walker-run", "N": "6",
-                     "expert": "125", "its policy alone": "100", "student": "88",
-                     "`plain` keeps": "-"}
+                     "expert": "125", "its policy alone": "100", "student": "100",
+                     "`--preset plain` keeps": "-"}
     # over both evaluation seeds: 100, 75, 125, 100; students of each episode less 210 and 20
     assert [*search.values()] == ["walker-run", "125", "100", "115", "100", "-15 ± 14", "9.0",
                                   "1.0", "5.0", "2.0"]
