@@ -1,6 +1,6 @@
 """Your own robot: an arm of NumPy alone, its expert trained, its student distilled, both played in
-two minutes. A robot has `reset(seed)`, which returns an observation, and `step(action)`, which
-returns the next one and a reward; actions are in [-1, 1]."""
+two minutes. A robot has its sizes, `reset(seed)`, which returns an observation, and `step(action)`,
+which returns the next one and a reward; actions are in [-1, 1]."""
 import sys
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from train_expert import ReplayBuffer  # noqa: E402
 
 class Arm:
     """Two joints, moved by torques, whose tip should reach a target: 8 features, 2 actions."""
+    dim_obs, dim_action = 8, 2
 
     def reset(self, seed):
         rng = np.random.default_rng(seed)
@@ -34,9 +35,9 @@ class Arm:
 def main(episodes=24, updates=400, steps=3000, out=Path("runs/own-robot")):
     """Train for so many episodes, with so many updates after each; distil for so many steps."""
     robot, rng, planning = Arm(), np.random.default_rng(0), fac.PlannerConfig(samples=64)
-    sizes = fac.ModelConfig(dim_obs=8, dim_action=2, latent_dim=16, enc_dim=32, mlp_dim=64)
+    sizes = fac.ModelConfig(robot.dim_obs, robot.dim_action, latent_dim=16, enc_dim=32, mlp_dim=64)
     learner = Learner(sizes, ExpertConfig(), rng)
-    expert, buffer = learner.model, ReplayBuffer(8, 2, 10 ** 6, steps=fac.EPISODE_STEPS - 1)
+    expert, buffer = learner.model, ReplayBuffer(robot.dim_obs, robot.dim_action, 10 ** 6)
     for i in range(episodes):  # less and less exploration
         found = fac.play(expert, None, planning, [i], environment=robot, noise=1 - i / episodes)
         buffer.add(found[0][0], found[1][0, :-1], found[2][0, :-1])
