@@ -27,9 +27,9 @@ the case N = 1. There is one world model, one planner, one loss. The axes, every
 A decision is one planned action, which the robot repeats for two control steps; a proposal is an
 action sequence that the expert's policy suggests to a plan. What a student computes in training:
 
-    observation g (O, B) -> the expert's f_E, frozen -> its latent (1, F, B)
+    observation g (O, B) -> the expert's f_E, frozen -> its latent (1, F, B) [D3]
       -> the student's f_E -> cut into s^1, ..., s^N: (N, m, B), each repeated for K copies
-    (s^i_h, a^i_h) -> f_T^i -> s^i_{h+1} for h = 0 ... H: columns (L, B, K), copies side by side
+    (s^i_h, a^i_h) -> f_T^i -> s^i_{h+1} for h < H: columns (L, B, K), copies side by side
                    -> f_R^i, f_Q^i -> agent i's shares of reward and value (N, L, B, K)
     sum over i -> R_h, Q_h (L, B, K) -> softmax over K -> divergence from the expert's (Equation 4)
 
@@ -75,7 +75,8 @@ class ModelConfig(Settings):
     latent_dim: int = field(50, "m: latent features of an agent (Table 2)", least=1)
     enc_dim: int = field(256, "hidden width of the encoder (Table 2)", least=1)
     mlp_dim: int = field(512, "hidden width of an agent's other networks (Table 2)", least=1)
-    expert_latent_dim: int = field(0, "of the expert's latent, if that is encoded", least=0)
+    expert_latent_dim: int = field(0, "features of the expert's latent, if that is encoded",
+                                   least=0)
     expert_enc_dim: int = field(256, "hidden width of the expert's encoder", least=1)
     expert_mlp_dim: int = field(0, "of its frozen policy and dynamics [D9]; 0: none", least=0)
     groups: str = field("", "robot's action dimensions of each agent, 0,2/1,3; '': in order")
@@ -102,14 +103,9 @@ class PlannerConfig(Settings):
     inverse_temperature: float = field(0.5, "an elite weighs exp(this * G) (Table 2)", above=0)
     momentum: float = field(0.1, "part of the old mean in the new (TD-MPC's code)", least=0, most=1)
     returns: str = field("fast", "Equation 2, plain or fast", choices=("fast", "plain"))
-    output: str = field("sampled", "an elite drawn by score (TD-MPC's code), or the mean",
+    output: str = field("sampled", "an elite drawn by score (TD-MPC's code), or the mean [D5]",
                         paper="mean", choices=("sampled", "mean"))
     action_repeat: int = field(ACTION_REPEAT, "control steps a decision", repr=False)
-
-    @property
-    def episode_steps(self):
-        """T: decisions in an episode."""
-        return CONTROL_STEPS // self.action_repeat
 
     @property
     def num_elites(self):
@@ -345,7 +341,7 @@ class WorldModel:
         return cls(config, params)
 
     def forward(self, name, x, tape=None):
-        """Run one of its NETWORKS on x (n, in, B); and back."""
+        """Run one of its NETWORKS on x (N, in, B; the encoder's N is 1). `backward`: and back."""
         return forward(NETWORKS[name], self.params, name, x, tape)
 
     def backward(self, name, tape, dy, grads):
@@ -365,7 +361,7 @@ class WorldModel:
         return self.backward("_encoder", tape, dz.reshape(1, -1, dz.shape[-1]), grads)
 
     def features(self, obs, z):
-        """What it reads (1, F, B): observations (O, B), or the expert's latents z of them [D3]."""
+        """What its encoder reads (1, F, B): obs (O, B), or the expert's latents z of these [D3]."""
         return z.reshape(1, -1, z.shape[-1]) if self.config.expert_latent_dim else obs[None]
 
     def next(self, z, a):
@@ -423,7 +419,7 @@ def unroll(model, z, actions, tapes=None):
     """Roll a model's latent out under given actions; all h side by side, so that heads run once.
 
     z (N, m, B), actions (L, A, B, K): K perturbed copies of a trajectory. Returns the networks'
-    input x (N, m + d, L * B * K), columns in the order (L, B, K); tapes, "_dynamics h" for h."""
+    input x (N, m + d, L * B * K), columns in the order (L, B, K). tapes: a defaultdict(list)."""
     L, _, B, K = actions.shape
     n, m, d = model.config.num_agents, model.config.latent_dim, model.config.agent_actions
     x = np.empty((n, m + d, L * B * K), z.dtype)
@@ -453,14 +449,14 @@ def heads_backward(model, tapes, d_shares, grads):
     """Walk `run_heads` back: adds to `grads`, returns dx (N, m + d, L * B * K). d_shares: gradients
     by each share (N, L, B, K), or by sums of shares (fewer rows), the same for each summand."""
     n, dx = model.config.num_agents, 0
-    for name, d in zip(HEADS, d_shares):
-        d = np.repeat(d, n // len(d), 0).reshape(n, 1, -1)
-        dx = dx + model.backward(name, tapes[name], d, grads)
+    for name, dy in zip(HEADS, d_shares):
+        dy = np.repeat(dy, n // len(dy), 0).reshape(n, 1, -1)
+        dx = dx + model.backward(name, tapes[name], dy, grads)
     return dx
 
 
 def unroll_backward(model, tapes, actions, dx, grads):
-    """Walk `unroll` back from its x's gradient dx, used up: adds to `grads`; dz (N, m, B)."""
+    """Walk `unroll` back from its x's gradient dx, used up: adds to `grads`, returns dz, as z."""
     (L, _, B, K), n, m = actions.shape, model.config.num_agents, model.config.latent_dim
     for h in reversed(range(L - 1)):
         now, after = (slice(i * B * K, (i + 1) * B * K) for i in (h, h + 1))
@@ -500,7 +496,7 @@ def distill_loss(student, features, actions, targets, config, grads=None, diverg
 
     features (1, F, B): what the student's encoder reads in the first states; actions (L, A, B, K):
     perturbed; targets: what the expert predicts for them, three (L, B, K), or each agent's part,
-    (N, L, B, K) [D9]. divergence: D. Returns loss, mean divergences of reward and of value."""
+    (N, L, B, K) [D9], whose D add up; divergence: D. Returns loss, mean D of reward, of value."""
     tapes, encoder_tape = defaultdict(list), []
     z = student.encode_features(features, encoder_tape)
     x = unroll(student, z, actions, tapes)
@@ -567,7 +563,8 @@ def distill(expert, replay, config, num_agents=None, seed=0):
     """Algorithm 1: a factored student of an expert; yields it with each step's losses.
 
     replay: the dataset; `starts` are rows that H + 1 actions follow, `sequences` g_0 and these.
-    Part II's `Distiller` is this with pools of predictions [D1], more states [D8], credit [D9]."""
+    Part II's `Distiller` is this with what is left out: `reuse` [D1], `expert_episodes` and
+    `policy_share` [D8], `targets` [D9]."""
     agents = expert.config.dim_action if num_agents is None else num_agents
     sizes = student_config(expert.config, agents, config.encoder_input)
     optimizer, student = new_student(expert, sizes, seed)
@@ -587,7 +584,7 @@ def distill(expert, replay, config, num_agents=None, seed=0):
 def h_step_return(model, z, actions, config):
     """Equation 2 for every agent as it reads; `Returns` computes the same faster.
 
-        G = sum_{h=0}^{H-1} gamma^h r(s_h, a_h) + gamma^H Q(s_H, a_H),   s_{h+1} = f_T(s_h, a_h)
+        G = sum_{h=0}^{H-1} gamma^h f_R(s_h, a_h) + gamma^H f_Q(s_H, a_H),  s_{h+1} = f_T(s_h, a_h)
 
     z (N, m, 1), actions (N, H + 1, d, S) -> G_i (N, S). Q is the mean of the two: unlike TD-MPC's
     minimum, a mean of sums is the sum of means, as Proposition 1 needs [D4]."""
@@ -607,10 +604,10 @@ def mppi(returns, mean, config, rngs, proposals=None):
     one Generator for each agent; proposals (N, L, d, P): sequences that compete in every iteration.
     Elites are chosen agent by agent: a plan's G is sum_i G_i(a_i), so the best of each is the best
     of all (Equation 3, Proposition 1). N = 1 is centralized MPPI. Returns the new mean (N, L, d),
-    the last elites (N, L, d, E), scores (N, E) of sum 1, NaN where an agent has no finite G."""
+    the last elites (N, L, d, E), scores (N, E) of sum 1, NaN where an agent has no finite G; of no
+    iterations None, None."""
     mean, std, elites, scores = mean[..., None], F32(config.max_std), None, None
-    if proposals is not None:
-        G_proposals = returns(proposals)
+    G_proposals = None if proposals is None else returns(proposals)
     for _ in range(config.iterations):
         actions = np.stack([rng.standard_normal((*mean.shape[1:3], config.samples), F32)
                             for rng in rngs])
@@ -658,15 +655,15 @@ def policy_rollout(model, z, noise):
 
 
 class AgentPlanner:
-    """Plans for all, some or one of a model's agents, from their latents: each agent's plan depends
-    on its own latent, model and stream alone. Part II has it faster, and in processes."""
+    """Plans for all, some or one of a model's agents: each agent's plan depends on its own latent,
+    model, stream and prior alone. Part II has it faster, and in processes."""
 
     def __init__(self, model, config):
         self.model, self.config = model, config
         self.reset()
 
     def reset(self, seeds=()):
-        """Start an episode from a mean of zero; with SeedSequences, of agents, new streams."""
+        """Start an episode from a mean of zero; SeedSequences, of agents, start their streams."""
         sizes = self.model.config
         self.mean = np.zeros((sizes.num_agents, self.config.horizon + 1, sizes.agent_actions), F32)
         if seeds:
@@ -682,9 +679,9 @@ class AgentPlanner:
 
     def search(self, z, mean):
         """`mppi` from the latent z (N, m, 1) and a first mean (N, L, d)."""
-        return mppi(self.returns(z), mean, self.config, self.rngs, self.proposals(z))
+        return mppi(self.returns_from(z), mean, self.config, self.rngs, self.proposals(z))
 
-    def returns(self, z):
+    def returns_from(self, z):
         """What `mppi` asks: actions (N, L, d, S) -> G (N, S)."""
         return functools.partial(h_step_return, self.model, z, config=self.config)
 
@@ -932,7 +929,7 @@ def credit(expert, tapes, actions, predicted, sizes):
         part^i(y_h)_k = sum_{j <= h} (a_j^i,k - a_j^i,0) . (g_j^i,k + g_j^i,0) / 2,  g_j = dy_h/da_j
 
     What these leave of y_h,k - y_h,0 is shared evenly. So the parts add up to the change, and the
-    one part of N = 1 teaches what the paper's joint divergence does: a softmax knows no constants.
+    one part of N = 1 teaches what joint targets do (a softmax knows no constants), but both Q one.
 
     expert: of one agent; tapes: of `unroll` and `run_heads` for its actions (L, A, B, K), used up;
     predicted: three (L, B, K); sizes: the agents' ModelConfig. Returns the reward's parts
@@ -1085,13 +1082,13 @@ class Distiller:
         rng, L = stream(self.seed, f"pool {number}", part), self.config.horizon + 1
         obs, actions = self.replay.sequences(rng.choice(self.train_starts, size), L)
         is_played = len(self.played) and rng.random(size) < self.config.played_share
-        if count := np.sum(is_played):
-            episode = rng.integers(len(self.lengths), size=count)
+        if n := np.sum(is_played):
+            episode = rng.integers(len(self.lengths), size=n)
             t = rng.integers(self.lengths[episode] - L + 1) + np.arange(L)[:, None]
             rows = (np.cumsum(self.lengths) - self.lengths)[episode] + t
             seen, done = np.split(self.played[rows].swapaxes(1, 2).astype(F32),
                                   [self.replay.dim_obs], 1)
-            obs[:, is_played], actions[:, :, is_played] = seen[0], done  # seen (L, O, count)
+            obs[:, is_played], actions[:, :, is_played] = seen[0], done  # seen (L, O, n)
         if self.config.policy_share:
             actions = around_policy(self.expert, obs, actions, self.config.policy_share, rng)
         return self.perturb(self.expert, self.student, obs, actions[..., None], self.config, rng)
@@ -1168,7 +1165,7 @@ class Distiller:
         self._number = None  # its pool is drawn again, with them
 
     def state(self):
-        """Everything that a resumed run needs."""
+        """Everything that a resumed run needs; its arrays, which the next `step` overwrites."""
         return {**optimizer_state(self.optimizer), "played": self.played, "lengths": self.lengths}
 
     def load(self, state):
@@ -1207,9 +1204,9 @@ class PlainDistiller(Distiller):
 
     def step(self):
         """The loop's next, whose student is kept."""
-        student, losses = next(self._plain)
-        for key, value in self.optimizer.params.items():
-            value[:] = student.params[key]
+        with one_thread():
+            student, losses = next(self._plain)
+        self.optimizer.vector[:] = flatten({k: student.params[k] for k in self.optimizer.params})[0]
         self.optimizer.t += 1
         return losses
 
@@ -1385,8 +1382,8 @@ class FastPlanner(AgentPlanner):
         plain = config.returns == "plain" or type(model).forward is not WorldModel.forward
         self.fast = None if plain else Returns(model)
 
-    def returns(self, z):
-        return self.fast.start(z, self.config) if self.fast else super().returns(z)
+    def returns_from(self, z):
+        return self.fast.start(z, self.config) if self.fast else super().returns_from(z)
 
     def search(self, z, mean):
         mean, elites, scores = super().search(z, mean)
@@ -1421,9 +1418,9 @@ def student_search(distiller, planning, states=256):
     """What a student plans with instead [D9], and what a wide search gains, (mean, standard error).
 
     Far from the policy are better plans, and plans that only the student's errors promise. So it
-    searches widely if, by two standard errors, the expert thinks more of the plans it finds so in
-    held-out states. A narrow search of many agents, where samples cost most, needs fewer, though
-    no fewer than the elites that `planning` asks for."""
+    searches widely if, by two standard errors (as if states were independent), the expert thinks
+    more of the plans it finds so in held-out states. A narrow search of many agents, where samples
+    cost most, needs fewer, though no fewer than the elites that `planning` asks for."""
     rows = stream(distiller.seed, "search").choice(distiller.held_out_starts, states)
     obs, _ = distiller.replay.sequences(rows, 1)
     wide = dataclasses.replace(planning, max_std=max(planning.max_std, WIDE_SEARCH["max_std"]))
@@ -1431,8 +1428,8 @@ def student_search(distiller, planning, states=256):
                           for config in (wide, planning)))
     gain, error = float(gains.mean()), float(gains.std(ddof=1) / states ** 0.5)
     small = {**SMALL_SEARCH, "samples": max(SMALL_SEARCH["samples"], planning.elites)}
-    narrow = small if distiller.student.config.num_agents >= MANY_AGENTS else {}
-    return WIDE_SEARCH if gain > 2 * error else narrow, (gain, error)
+    many = distiller.student.config.num_agents >= MANY_AGENTS and planning.max_std < wide.max_std
+    return WIDE_SEARCH if gain > 2 * error else small if many else {}, (gain, error)
 
 
 # ==== 9. The same, in processes: workers plan for a part of the agents each ============
@@ -1779,7 +1776,7 @@ def robot_step(robot, action, sizes, t):
 def robot_steps(robot, config):
     """T of a robot: its `episode_steps`, if it has some, or a PlannerConfig's."""
     found = getattr(robot, "episode_steps", None)
-    T = config.episode_steps if found is None else found
+    T = episode_steps(config.action_repeat) if found is None else found
     need(isinstance(T, (int, np.integer)) and T > 0, "the robot's episode_steps: expected a whole "
          f"number above 0, found {T!r}")
     return int(T)

@@ -104,8 +104,8 @@ def command_watch(args):
     repeats = {config.action_repeat for config in configs}
     fac.need(len(repeats) == 1, f"{args.beside}: decides every {configs[-1].action_repeat} control "
              f"steps, {args.model} every {configs[0].action_repeat}: they can't be shown in step")
-    fac.need(args.decisions <= configs[0].episode_steps, f"--decisions: an episode has "
-             f"{configs[0].episode_steps}, not {args.decisions}")
+    steps = fac.episode_steps(configs[0].action_repeat)
+    fac.need(args.decisions <= steps, f"--decisions: an episode has {steps}, not {args.decisions}")
     (seed,) = fac.episode_seeds(args.seed, 1, first=args.episode)
     episodes = [watch_episode(*found, task, seed, args.decisions, args.every)
                 for found in models]
@@ -213,7 +213,7 @@ def command_figure9(args):
     plt, began = pyplot_for(args.out), time.time()
     need_sklearn()
     config = fac.PlannerConfig(**fac.made_for(header, args.model))
-    most = config.episode_steps - SMOOTH
+    most = fac.episode_steps(config.action_repeat) - SMOOTH
     fac.need(model.config.latent_dim > 1 and config.horizon < most,
              f"{args.model}: expected latents of 2 or more and a horizon below {most}, found "
              f"{model.config.latent_dim}, {config.horizon}")

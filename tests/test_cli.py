@@ -458,19 +458,20 @@ def test_who_finds_better_plans_far_away_searches_widely(
     assert result["wide_search_gain"] == (gain and [wider, 0.0])
 
 
-@pytest.mark.parametrize("agents, gain, noise, expected", [
-    (11, -1.0, 0.0, {}), (12, -1.0, 0.0, {"samples": 16, "iterations": 2}),
-    (12, 1.0, 0.0, {"max_std": 1.0}), (3, 1.0, 0.0, {"max_std": 1.0}),
-    (3, 0.1, 1.0, {}), (3, 0.2, 1.0, {"max_std": 1.0})])  # 1.6 and 3.2 standard errors
+@pytest.mark.parametrize("agents, width, gain, noise, expected", [
+    (11, 0.15, -1.0, 0.0, {}), (12, 0.15, -1.0, 0.0, {"samples": 16, "iterations": 2}),
+    (12, 0.15, 1.0, 0.0, {"max_std": 1.0}), (3, 0.15, 1.0, 0.0, {"max_std": 1.0}),
+    (3, 0.15, 0.1, 1.0, {}), (3, 0.15, 0.2, 1.0, {"max_std": 1.0}),  # 1.6, 3.2 standard errors
+    (12, 2.0, 0.0, 0.0, {})])  # one that a flag made wide
 def test_a_search_is_wide_where_its_gain_is_sure_and_small_where_many_agents_do_not(
-        files, monkeypatch, agents, gain, noise, expected):
+        files, monkeypatch, agents, width, gain, noise, expected):
     values = noise * np.tile([-1.0, 1.0], 128)
     monkeypatch.setattr(fac, "plan_gains", lambda expert, student, planning, obs: [
         gain + values if planning.max_std == 1 else 0 * values])
     distiller = SimpleNamespace(
         seed=0, expert=None, held_out_starts=np.arange(9), replay=fac.Replay(files / "replay.npz"),
         student=SimpleNamespace(config=SimpleNamespace(num_agents=agents)))
-    search, (mean, error) = fac.student_search(distiller, fac.PlannerConfig(max_std=0.15))
+    search, (mean, error) = fac.student_search(distiller, fac.PlannerConfig(max_std=width))
     assert search == expected
     np.testing.assert_allclose((mean, error), (gain, noise / 16), rtol=0.01)
 

@@ -601,3 +601,22 @@ def test_the_distiller_is_algorithm_1_in_less_time(replay, monkeypatch, num_agen
                                    atol=2e-4, err_msg=key)
     np.testing.assert_allclose([found for _, found in plain], losses, rtol=1e-3)
     assert losses[-1, 0] < 0.97 * losses[0, 0]
+
+
+def test_a_plain_step_takes_one_thread_as_every_other(replay, monkeypatch):
+    from threadpoolctl import threadpool_limits
+    config = fac.dataclasses.replace(CONFIG, targets="joint", policy_share=0.0, reuse=1)
+    seen = []
+
+    def watched(*arguments):
+        for found in plain(*arguments):
+            seen.extend(pool["num_threads"] for pool in fac._thread_pools().info()
+                        if pool["user_api"] == "blas")  # not SciPy's, loaded later
+            yield found
+
+    plain = fac.distill
+    monkeypatch.setattr(fac, "distill", watched)
+    with threadpool_limits(2), contextlib.closing(
+            fac.PlainDistiller(random_model(n=1, policy=True), replay, config)) as distiller:
+        distiller.step()
+    assert set(seen) == {1}

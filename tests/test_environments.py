@@ -131,7 +131,7 @@ def test_an_action_is_repeated_as_often_as_asked(repeat):
     np.testing.assert_allclose(seen[1][0], seen[repeat][0], rtol=1e-6)
     assert seen[1][1] == pytest.approx(seen[repeat][1])
     config = fac.PlannerConfig(samples=2, iterations=1, horizon=0, action_repeat=repeat)
-    assert config.episode_steps == 1000 // repeat
+    assert fac.episode_steps(config.action_repeat) == 1000 // repeat
 
 
 @pytest.mark.parametrize("workers", [0, 1])

@@ -219,7 +219,7 @@ def test_warm_start_shifts_by_one():
     z = model.encode(np.zeros((8, 1), np.float32))
     for one in (planner, twin):
         one.reset(np.random.SeedSequence(0).spawn(3))
-    mean, _, _ = fac.mppi(twin.returns(z), twin.mean, config, twin.rngs)
+    mean, _, _ = fac.mppi(twin.returns_from(z), twin.mean, config, twin.rngs)
     planner.plan(z)
     assert np.array_equal(planner.mean[:, :-1], mean[:, 1:])
     assert not planner.mean[:, -1].any() and planner.mean[:, :-1].any()
