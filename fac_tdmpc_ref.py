@@ -349,7 +349,8 @@ class WorldModel:
 
     def encode(self, obs):
         """s = f_E(g).  obs (O, B) -> latents (N, m, B)."""
-        return self.encode_features(self.expert.encode(obs) if self.expert else obs[None])
+        return self.encode_features(self.expert.encode(obs) if self.config.expert_latent_dim
+                                    else obs[None])
 
     def encode_features(self, x, tape=None):
         """The trained encoder on (1, F, B); its output is cut into the agents' latents."""

@@ -7,15 +7,12 @@ to; MPPI plans latent actions, of which the robot gets the first, decoded. The V
 from its own loss (reconstruction and KL to the prior), and stays as it is then.
 """
 import functools
-import sys
 from collections import defaultdict
-from pathlib import Path
 
 import numpy as np
 
-sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
-import fac_tdmpc_ref as fac  # noqa: E402
-from numpy_learner import latents_after, latents_after_backward  # noqa: E402
+import fac_tdmpc_ref as fac
+from numpy_learner import latents_after, latents_after_backward
 
 # ------------------------------------------------------------------ other losses, other sizes
 
@@ -161,15 +158,13 @@ class TapDistiller(fac.Distiller):
         K, z = config.noise_samples, expert.encode(obs)
         latent, inputs = [], []  # the latter as `unroll` gives them: (1, m + A, B * K) each
         for a in np.broadcast_to(actions, (L, A, B, K)).reshape(L, A, -1):
-            s = (fac.forward(fac.MLP, expert.params, "_dynamics", inputs[-1]) if inputs
-                 else np.repeat(z, K, 2))
+            s = expert.forward("_dynamics", inputs[-1]) if inputs else np.repeat(z, K, 2)
             noise = fac.F32(config.noise_std) * rng.standard_normal((LATENT_ACTION, B * K), fac.F32)
             u = self.vae.encode(np.concatenate([s[0], a])) + noise
             latent.append(np.clip(u, -1, 1))
             inputs.append(np.concatenate([s, self.vae.decode(s[0], latent[-1])[None]], 1))
         latent = np.stack(latent).reshape(L, -1, B, K)
-        features = z if student.config.expert_latent_dim else obs[None]
-        return features, latent, [
+        return student.features(obs, z), latent, [
             y.sum(0) for y in fac.run_heads(expert, np.concatenate(inputs, 2), latent)]
 
 

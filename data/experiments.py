@@ -309,8 +309,8 @@ def distil_all(args, cases):
 
 def distil_runs(args, cases):
     """A run for each seed and task, and each (case, settings) of cases(task)."""
-    budget = {k: getattr(args, k) for k in ("steps", "evaluations", "episodes", "samples",
-                                            "iterations")}
+    budget = {k: getattr(args, k, None) for k in ("steps", "evaluations", "episodes", "samples",
+                                                  "iterations")}
     data = {task: data_checksums(task) for task in args.tasks}
     return [make_run(task, seed, case, data=data[task], **{**budget, **settings})
             for seed, task in itertools.product(args.seeds, args.tasks)
@@ -369,13 +369,10 @@ def command_departures(args):
 def command_students(args):
     """students: what `distill` makes by default, for the README's main table."""
     config = fac.DistillConfig(**fac.preset_values(fac.DistillConfig, args.preset))
-    about = {"steps": args.steps or config.steps, **{
-        k: v for k in ("samples", "iterations") if (v := getattr(args, k))}}
-    data = {task: data_checksums(task) for task in args.tasks}
-    return run_all(args, functools.partial(students.distil_student, students=args.students), [
-        make_run(task, seed, args.preset, data=data[task], episodes=args.episodes,
-                 num_agents=fac.lookup_task(task)[3], **about)
-        for seed, task in itertools.product(args.seeds, args.tasks)])
+    args.steps = args.steps or config.steps
+    return run_all(args, functools.partial(students.distil_student, students=args.students),
+                   distil_runs(args, lambda task: [
+                       (args.preset, {"num_agents": fac.lookup_task(task)[3]})]))
 
 
 def command_sweep(args):
@@ -838,7 +835,7 @@ def make_parser():
                              help="of a run at most, evenly over its steps [%(default)s]")
             for name in ("samples", "iterations"):
                 sub.add_argument(f"--{name}", type=positive, help="MPPI's, in evaluations "
-                                 f"[{getattr(fac.PlannerConfig, name)}]")
+                                 f"[{fac.STUDENT_PLANNING[name]}]")
         return sub
 
     walkers = ["walker-walk", "walker-run"]

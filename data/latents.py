@@ -1,13 +1,10 @@
 """Figure 10, middle and right: agents' latents by joint, task and robot, {task: (N, m, B)} in B
 states of each; `multitask.py latents` and `figure10` are the commands."""
-import sys
-from pathlib import Path
 
 import numpy as np
 
-sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
-import fac_tdmpc_ref as fac  # noqa: E402
-import look  # noqa: E402
+import fac_tdmpc_ref as fac
+import look
 
 WITHIN, BETWEEN = "walker, task by task", "walker and hopper"
 
@@ -22,10 +19,8 @@ def comparisons(tasks):
 
 def stacked(latents):
     """Latents {task: (N, m, B)} as points (n, m), their joints (n,) and tasks (n,)."""
-    x = np.concatenate([z.swapaxes(1, 2).reshape(-1, z.shape[1]) for z in latents.values()])
-    joints = np.concatenate([np.repeat(np.arange(len(z)), z.shape[2]) for z in latents.values()])
-    tasks = np.repeat([*latents], [z.shape[0] * z.shape[2] for z in latents.values()])
-    return x, joints, tasks
+    x, joints = map(np.concatenate, zip(*map(look.points_of, latents.values())))
+    return x, joints, np.repeat([*latents], [z.shape[0] * z.shape[2] for z in latents.values()])
 
 
 def silhouettes(latents, rng):
@@ -40,12 +35,6 @@ def silhouettes(latents, rng):
                 x[joints == i], tasks[joints == i]) for i in common]))}
 
 
-def labelled(z, joints):
-    """The latents (n, m) of some joints of z (N, m, B), and 0, 1, ... (n,) for their order."""
-    x = z[list(joints)].swapaxes(1, 2)
-    return x.reshape(-1, z.shape[1]), np.repeat(np.arange(len(joints)), z.shape[2])
-
-
 def recognition(walker, hopper):
     """Accuracies (chance: 1/3) of a classifier of hip, knee and ankle that learned from one leg's
     latents (N, m, B): in other states, on another leg, and on the agents of the other robot that
@@ -54,15 +43,15 @@ def recognition(walker, hopper):
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
     found, half = {}, walker.shape[2] // 2
-    right, left = (walker, (0, 1, 2)), (walker, (3, 4, 5))  # hip, knee, ankle
-    leg = (hopper, (1, 2, 3))  # 0 is the waist
+    right, left = (walker, [0, 1, 2]), (walker, [3, 4, 5])  # hip, knee, ankle
+    leg = (hopper, [1, 2, 3])  # 0 is the waist
     for name, (z, own), (other, theirs) in (
             ("walker's right leg, then hopper", right, leg),
             ("hopper, then walker's right leg", leg, right),
             ("walker's right leg, then its left", right, left)):
         classifier = make_pipeline(StandardScaler(), LogisticRegression(max_iter=1000))
-        classifier.fit(*labelled(z[:, :, :half], own))
-        found[name] = {of: float(classifier.score(*labelled(points, joints)))
+        classifier.fit(*look.points_of(z[own, :, :half]))
+        found[name] = {of: float(classifier.score(*look.points_of(points[joints])))
                        for of, points, joints in (("itself", z[:, :, half:], own),
                                                   ("other leg", other, theirs),
                                                   ("same slots there", other[:, :, half:], own))}
@@ -112,9 +101,3 @@ def print_tables(found):
             title = "silhouette by" if rows is groups else "accuracy, chance 0.33"
             fac.print_table([(title, *heads), *(
                 (name, *(f"{of[head]:.2f}" for head in heads)) for name, of in rows.items())])
-
-
-def need_plots(path):
-    """UserError, before the work, if no picture can be made there, or scikit-learn is missing."""
-    look.pyplot_for(path)
-    look.need_sklearn()

@@ -1,4 +1,5 @@
 """Section 5.6: look into a model: `experiments.py watch`, `figure9` and `agreement` are here."""
+import contextlib
 import functools
 import os
 import subprocess
@@ -8,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
-import fac_tdmpc_ref as fac  # noqa: E402
+import fac_tdmpc_ref as fac
 
 PIXELS, BARS, TEXT = 240, 70, 34  # a picture's side, width of the bars beside, height of the text
 RENDERERS = "from dm_control import suite; suite.load('reacher', 'easy').physics.render(8, 8)"
@@ -41,24 +41,15 @@ def watch_episode(path, model, header, task, seed, decisions, every):
     """Frames of a model's episode: picture, shares (N,) and return so far of each; its name, the
     median milliseconds of a decision, and the return in the end."""
     config = fac.PlannerConfig(**fac.made_for(header, path))
-    environment = fac.Environment(task, config.action_repeat, render=True)
-    frames, total, seconds = [], 0.0, []
-    with fac.Planner(model, config) as planner, fac.progress(f"playing {path}", decisions,
-                                                             "decision") as bar:
-        planner.reset(seed)
-        obs = environment.reset(seed)
-        for t in range(decisions):
-            if t % every == 0:
-                picture = environment.env.physics.render(PIXELS, PIXELS, camera_id=0)
-                frames.append((picture, shares(model, model.encode(obs[:, None]), config), total))
-            begin = time.perf_counter()
-            action = planner.act(obs)
-            seconds.append(time.perf_counter() - begin)
-            obs, reward = environment.step(action)
-            total += reward
-            bar.update()
+    environment = fac.Environment(task, config.action_repeat)
+    environment.episode_steps = decisions  # it ends there
+    obs, actions, rewards, seconds = (x[0] for x in fac.play(
+        model, task, config, [seed], label=f"playing {path}", environment=environment))
+    pictures = frames_at(task, seed, actions, range(0, decisions, every), config.action_repeat)
+    frames = [(picture, shares(model, model.encode(obs[t][:, None]), config), rewards[:t].sum())
+              for t, picture in pictures.items()]
     name = f"{header['kind']}, N = {model.config.num_agents}"
-    return frames, name, 1e3 * float(np.median(seconds)), total
+    return frames, name, 1e3 * float(np.median(seconds)), float(rewards.sum())
 
 
 def draw_frames(episodes):
@@ -137,10 +128,12 @@ def pyplot_for(path):
     return fac.pyplot()
 
 
-def need_sklearn():
-    """UserError, before the work, if scikit-learn is missing."""
+def need_plots(path):
+    """`pyplot_for`; UserError, before the work, if scikit-learn is missing, too."""
+    plt = pyplot_for(path)
     with fac.optional("scikit-learn", "experiments"):
         import sklearn  # noqa: F401
+    return plt
 
 
 SMOOTH = 10  # decisions over which a change of the return counts
@@ -152,15 +145,17 @@ def t_sne(x):
     return TSNE(random_state=0, init="pca", perplexity=min(30, len(x) / 4)).fit_transform(x)
 
 
+def points_of(z):
+    """Latents (N, m, B) as points (n, m), and their joints (n,)."""
+    return z.swapaxes(1, 2).reshape(-1, z.shape[1]), np.repeat(np.arange(len(z)), z.shape[2])
+
+
 def clusters(z, rng, points):
     """Latents (N, m, B) of some states as points: t-SNE and PCA, (n, 2) each, their joints (n,),
     and the silhouette by joint and by shuffled joints."""
-    need_sklearn()
     from sklearn.decomposition import PCA
     from sklearn.metrics import silhouette_score
-    chosen = z[:, :, rng.choice(z.shape[2], min(points, z.shape[2]), replace=False)]
-    x = chosen.swapaxes(1, 2).reshape(-1, z.shape[1])
-    joints = np.repeat(np.arange(len(z)), chosen.shape[2])
+    x, joints = points_of(z[:, :, rng.choice(z.shape[2], min(points, z.shape[2]), replace=False)])
     flat = t_sne(x), PCA(2).fit_transform(x)
     one = len(z) == 1  # no other joints to be apart from
     return *flat, joints, *(None if one else float(silhouette_score(x, labels))
@@ -209,9 +204,10 @@ def frames_at(task, seed, actions, moments, action_repeat):
 
 def command_figure9(args):
     """figure9: latents by joint, and what each joint contributes in the best and worst episode."""
+    with contextlib.suppress(fac.UserError):  # `frames_at` says it
+        choose_renderer()  # before a task's sizes are looked up in dm_control
     model, header, task = open_model(args, kinds=["student"])
-    plt, began = pyplot_for(args.out), time.time()
-    need_sklearn()
+    plt, began = need_plots(args.out), time.time()
     config = fac.PlannerConfig(**fac.made_for(header, args.model))
     most = fac.episode_steps(config.action_repeat) - SMOOTH
     fac.need(model.config.latent_dim > 1 and config.horizon < most,

@@ -23,6 +23,7 @@ import experiments  # noqa: E402
 import fac_tdmpc_ref as fac  # noqa: E402
 import import_expert  # noqa: E402
 import latents  # noqa: E402
+import look  # noqa: E402
 from multitask_model import MultitaskDistiller, load, save  # noqa: E402
 from tdmpc2 import Checkpoint  # noqa: E402
 
@@ -215,11 +216,11 @@ def command_evaluate(args):
 
 # ----------------------------------------------------------------------------------- latents
 
-def latents_of(student, data, seed, task, states):
+def latents_of(student, data, held_out, seed, task, states):
     """Latents (N, m, B) of a task's agents in states of its replay's held-out episodes."""
     replay = fac.Replay(load_path(task, data, "replay.npz"))
     fac.check_task(replay, task, replay.path)
-    _, rows = replay.starts(1, fac.DistillConfig.held_out, seed)
+    _, rows = replay.starts(1, held_out, seed)
     rng = fac.stream(seed, "latents of " + task)
     obs, _ = replay.sequences(rng.permutation(rows)[:states], 1)
     return student.of_task(task).encode(obs)
@@ -228,13 +229,15 @@ def latents_of(student, data, seed, task, states):
 def command_latents(args):
     """latents: do agents' latents cluster by joint, and meet across tasks and robots?"""
     student, header = load(args.model)
-    latents.need_plots(args.out)
+    look.need_plots(args.out)
     fac.need(latents.comparisons(student.dims) and student.config.num_agents > 1, f"{args.model}: "
              "expected a factored student of two walker tasks, or of one and one of hopper, found "
              f"{student.config.num_agents} agents, {', '.join(student.dims)}")
+    config = fac.from_dict(fac.DistillConfig, header.get("distill"), f"{args.model}: distill")
     seed = header.get("seed", 0)
-    found = latents.compare(functools.partial(latents_of, student, args.data, seed), student.dims,
-                            args.points, seed, args.out)
+    found = latents.compare(functools.partial(
+        latents_of, student, args.data, config.held_out, seed), student.dims, args.points, seed,
+        args.out)
     latents.print_tables(found)
     print(args.out)
     return {**found, "out": args.out}
@@ -294,7 +297,7 @@ def command_figure10(args):
     """figure10: returns against steps of both students, teachers' beside; latents."""
     args.tasks = named(args.tasks) or small_tasks()
     config = read_config(args)
-    latents.need_plots(args.picture)
+    look.need_plots(args.picture)
     for seed, (case, centralized) in itertools.product(args.seeds, CASES.items()):
         with contextlib.redirect_stdout(sys.stderr):
             distil(args, config, student_folder(args.students, seed, case), seed, centralized)
@@ -315,7 +318,7 @@ def command_figure10(args):
     compared, picture = {}, Path(args.picture).with_name(f"{Path(args.picture).stem}-latents.png")
     for seed, (student, _) in students.items():
         compared[seed] = latents.compare(functools.partial(
-            latents_of, student, args.data, seed), student.dims, 100, seed,
+            latents_of, student, args.data, config.held_out, seed), student.dims, 100, seed,
             None if compared else picture)
         latents.print_tables(compared[seed])
     return {**result, "returns": found, "latents": compared, "picture": args.picture}

@@ -9,30 +9,16 @@ same time as a student of that task alone.
 """
 import dataclasses
 import functools
-import sys
-from pathlib import Path
 
 import numpy as np
 
-sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
-import fac_tdmpc_ref as fac  # noqa: E402
+import fac_tdmpc_ref as fac
 
 # ------------------------------------------------------------------------------- the student
 
 EMBEDDING = 96  # numbers that stand for a task (TD-MPC2)
 TASKS = "_embedding.0.weight"  # (1, EMBEDDING, tasks), columns of norm 1 at most
 SCALES = "_scale.0.weight"  # (1, O, tasks), not trained: what observations are multiplied by
-
-
-class TaskStudent(fac.WorldModel):
-    """One task's student: reads observations (O, B); its teacher's policy may begin plans."""
-
-    def __init__(self, config, params, teacher):
-        super().__init__(config, params)
-        self.expert = teacher
-
-    def encode(self, obs):
-        return self.encode_features(obs[None])
 
 
 class Multitask(fac.WorldModel):
@@ -77,7 +63,9 @@ class Multitask(fac.WorldModel):
         params["_encoder.0.weight"] = W[:, :, :dim_obs] * scale[:, None, :dim_obs]
         for key in ("_encoder.2.weight", "_encoder.2.bias"):
             params[key] = params[key][:, :n * sizes.latent_dim]
-        return TaskStudent(sizes, {key: v.copy() for key, v in params.items()}, teacher)
+        student = fac.WorldModel(sizes, {key: v.copy() for key, v in params.items()})
+        student.expert = teacher  # whose policy may begin plans
+        return student
 
 
 def weights(config):

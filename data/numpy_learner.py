@@ -55,15 +55,14 @@ def td_targets(model, target, obs, reward, noise, discount):
 def latents_after(model, x, columns, tape=None):
     """s_1, ..., s_L (N, m, L * columns) of `fac.unroll`'s x, which ends with s_{L-1}; the tape is
     the last step's."""
-    end = fac.forward(fac.MLP, model.params, "_dynamics", x[:, :, -columns:], tape)
+    end = model.forward("_dynamics", x[:, :, -columns:], tape)
     return np.concatenate([x[:, :model.config.latent_dim, columns:], end], 2)
 
 
 def latents_after_backward(model, tape, d, dx, columns, grads):
     """Walk `latents_after` back: adds its gradient d to x's, dx, and to `grads`."""
     dx[:, :model.config.latent_dim, columns:] += d[:, :, :-columns]
-    dx[:, :, -columns:] += fac.backward(fac.MLP, model.params, "_dynamics", tape,
-                                        d[:, :, -columns:], grads)
+    dx[:, :, -columns:] += model.backward("_dynamics", tape, d[:, :, -columns:], grads)
 
 
 def equation_1(model, obs, actions, reward, latents, td, config, grads=None):
@@ -100,7 +99,7 @@ def equation_1(model, obs, actions, reward, latents, td, config, grads=None):
         dx = fac.heads_backward(model, tapes, d_shares, grads)
         latents_after_backward(model, end_tape, d_latents, dx, B, grads)
         dz = fac.unroll_backward(model, tapes, actions, dx, grads)
-        fac.backward(fac.ENCODER, model.params, "_encoder", encoder_tape, dz, grads)
+        model.encode_backward(dz, encoder_tape, grads)
     return float(loss), terms, np.concatenate([z, after], 2)
 
 
@@ -110,18 +109,17 @@ def policy_loss(model, rollout, noise, lam, grads):
     rollout (1, m, L * B): the latents of `equation_1`, held fixed; noise (A, L, B). The clipping
     of the noisy action to [-1, 1] lets gradients through, as in TD-MPC's code."""
     tape, q_tapes, (dim_action, steps, batch) = [], ([], []), noise.shape
-    mu = np.tanh(fac.forward(fac.MLP, model.params, "_pi", rollout, tape))
+    mu = np.tanh(model.forward("_pi", rollout, tape))
     a = np.clip(mu + noise.reshape(1, dim_action, -1), -1, 1)
     x = np.concatenate([rollout, a], 1)
-    q1, q2 = (fac.forward(fac.QNET, model.params, name, x, q_tape)
-              for name, q_tape in zip(("_Q1", "_Q2"), q_tapes))
+    q1, q2 = (model.forward(name, x, q_tape) for name, q_tape in zip(fac.HEADS[1:], q_tapes))
     lam = np.repeat(lam ** np.arange(steps) / batch, batch).astype(x.dtype)
     first = np.where(q1 == q2, fac.F32(0.5), q1 < q2).astype(x.dtype)  # a tie counts half for each
     da = 0
     for name, q_tape, smaller in (("_Q1", q_tapes[0], first), ("_Q2", q_tapes[1], 1 - first)):
-        dx = fac.backward(fac.QNET, model.params, name, q_tape, -lam * smaller, None)
+        dx = model.backward(name, q_tape, -lam * smaller, None)
         da = da + dx[:, rollout.shape[1]:]
-    fac.backward(fac.MLP, model.params, "_pi", tape, fac.tanh_backward(da, mu), grads)
+    model.backward("_pi", tape, fac.tanh_backward(da, mu), grads)
     return -float((lam * np.minimum(q1, q2)).sum())
 
 

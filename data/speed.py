@@ -7,14 +7,11 @@ import dataclasses
 import functools
 import itertools
 import pickle
-import sys
-from pathlib import Path
 
 import numpy as np
 
-sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
-import fac_tdmpc_ref as fac  # noqa: E402
-from look import pyplot_for  # noqa: E402
+import fac_tdmpc_ref as fac
+from look import pyplot_for
 
 # robot: dim O, dim A (Figure 3), milliseconds of f_T, f_R, f_Q in TD-MPC and in Fac-TDMPC (Table 3)
 ROBOTS = {
@@ -31,7 +28,7 @@ TABLE3_BATCH = 512
 MODES = ("one-thread", "processes", "critical-path")
 
 
-class Predictor:
+class Predictor(fac.Workers):
     """f_T, f_R and f_Q alone, on fixed inputs: predictor("f_T").
 
     workers: processes beside this one that share the agents; their inputs are there already.
@@ -43,19 +40,14 @@ class Predictor:
         sizes = self.model.config
         self._x = np.random.default_rng(0).standard_normal(
             (sizes.num_agents, sizes.latent_dim + sizes.agent_actions, TABLE3_BATCH), fac.F32)
-        self._workers = fac.Workers(_prediction_worker, workers, "prediction worker")
-        self._workers.send_all(fac.some_agents(model, share.start, share.stop) for share in theirs)
+        super().__init__(_prediction_worker, workers, "prediction worker")
+        self.send_all(fac.some_agents(model, share.start, share.stop) for share in theirs)
 
     def __call__(self, function):
-        self._workers.send_all(itertools.repeat(function))
-        kinds = fac.QNET if function == "f_Q" else fac.MLP
+        self.send_all(itertools.repeat(function))
         for name in FUNCTIONS[function]:
-            fac.forward(kinds, self.model.params, name, self._x)
-        self._workers.receive_all()
-
-    def close(self):
-        """End the worker processes."""
-        self._workers.close()
+            self.model.forward(name, self._x)
+        self.receive_all()
 
 
 def _prediction_worker(connection):
@@ -79,7 +71,7 @@ def benchmark_prediction(robot, workers, runs):
     factored = random_model(robot, n, 512 // n, 512 // n)
     with contextlib.ExitStack() as stack:
         def predictor(*args):
-            return stack.enter_context(contextlib.closing(Predictor(*args)))
+            return stack.enter_context(Predictor(*args))
 
         subjects = [("TD-MPC", "one-thread", predictor(random_model(robot, 1, 512, 512))),
                     ("10% TD-MPC", "one-thread", predictor(random_model(robot, 1, 512, 66))),

@@ -1,13 +1,11 @@
 """Students as `distill` makes them, and their tables: `experiments.py students`."""
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 
-sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
-import fac_tdmpc_ref as fac  # noqa: E402
-from tables import deviation, markdown, of_returns  # noqa: E402
+import fac_tdmpc_ref as fac
+from tables import deviation, markdown, of_returns
 
 EVALUATION_SEEDS = (0, 1)
 MEASURED = ("rank_correlation", "plan_ms", "same_search_returns",  # of result.json, in a row

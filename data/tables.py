@@ -5,13 +5,10 @@ these returns (n). A ratio is one of means, never a mean of ratios.
 """
 import itertools
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 
-sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
-import fac_tdmpc_ref as fac  # noqa: E402
+import fac_tdmpc_ref as fac
 
 
 def deviation(values):

@@ -14,15 +14,12 @@ any pair is one such draw, and one that stays gives the same plan and the same t
 import dataclasses
 import itertools
 import math
-import sys
-from pathlib import Path
 
 import numpy as np
 
-sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
-import fac_tdmpc_ref as fac  # noqa: E402
-import import_expert  # noqa: E402
-from fac_tdmpc_ref import need  # noqa: E402
+import fac_tdmpc_ref as fac
+import import_expert
+from fac_tdmpc_ref import need
 
 # mt30's tasks in its order, by this project's names, also the first 30 of mt80. "-": this project
 # lacks the task. Its reachers have three links, so they are mt30's reacher-three, 26 and 27.

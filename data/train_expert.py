@@ -14,7 +14,6 @@ takes, student.npz, curve.csv and curve.png. A run that was cut off, by --minute
 on from its checkpoint when the same command is given again, to the same result; one that is over
 goes on with more --steps.
 """
-import contextlib
 import dataclasses
 import functools
 import sys
@@ -122,37 +121,34 @@ def _acting_worker(connection):
             connection.send([[e.arrays() for e in episodes] for episodes in played])
 
 
-class Actors:
+class Actors(fac.Workers):
     """Processes that play episodes, part by part, while this one learns."""
 
     def __init__(self, task, workers, action_repeat=None):
         fac.lookup_task(task)
-        self._workers, self._count = fac.Workers(_acting_worker, workers, "acting worker"), workers
-        self._workers.send_all([(task, action_repeat)] * workers)
+        super().__init__(_acting_worker, workers, "acting worker")
+        self._count = workers
+        self.send_all([(task, action_repeat)] * workers)
 
     def begin(self, episodes):
         """Start episodes: (seed, player, exploration_std) of each, or of a test (seed, player)."""
         self._begun = len(episodes)
-        self._workers.send_all(("begin", episodes[i::self._count]) for i in range(self._count))
+        self.send_all(("begin", episodes[i::self._count]) for i in range(self._count))
 
     def play(self, decisions, planners):
         """Let all go on, players with newer planners {player: (model, planner config)}."""
-        self._workers.send_all([("play", decisions, planners)] * self._count)
+        self.send_all([("play", decisions, planners)] * self._count)
 
     def wait(self):
         """Until they have."""
-        self._workers.receive_all()
+        self.receive_all()
 
     def episodes(self):
         """For each that was begun a list: of it and of those that followed it so far, what
         `ReplayBuffer.add` takes."""
-        self._workers.send_all([("give",)] * self._count)
-        played = self._workers.receive_all()
+        self.send_all([("give",)] * self._count)
+        played = self.receive_all()
         return [played[i % self._count][i // self._count] for i in range(self._begun)]
-
-    def close(self):
-        """End the processes."""
-        self._workers.close()
 
 
 # ------------------------------------------------------------------------------- learning
@@ -618,8 +614,7 @@ def train_in(out, args, config, planning, distilling):
                      "replace it; choose another --out")
     left = config.updates_per_step * max(0, args.steps - training.decisions)
     began, done = time.time(), False
-    with contextlib.closing(Actors(args.task, min(args.workers, args.envs),
-                                   planning.action_repeat)) as actors, \
+    with Actors(args.task, min(args.workers, args.envs), planning.action_repeat) as actors, \
             fac.one_thread(), fac.progress("training", int(training.allowed + left), "update",
                                            training.learner.updates) as bar:
         while not done and not (args.minutes and time.time() - began > 60 * args.minutes):
