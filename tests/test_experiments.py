@@ -1285,6 +1285,12 @@ def test_figure9_and_agreement_draw_a_model(tmp_path):
                           "--json", cwd=tmp_path))
     assert found["silhouette"] is not None and set(found["moments"]) == {"best", "worst"}
     assert (tmp_path / "figure9.png").read_bytes()[:4] == b"\x89PNG"
+    sizes = fac.ModelConfig(*fac.lookup_task("finger-spin")[2:], 2, 4, 8, 8)  # none of the 11
+    spin = fac.WorldModel.create(sizes, np.random.default_rng(0))
+    fac.save_model(tmp_path / "spin.npz", spin, {"kind": "student", "task": "finger-spin"})
+    found = last_json(run("figure9", "--model", "spin.npz", "--episodes", "1", "--points", "20",
+                          "--json", cwd=tmp_path))
+    assert found["task"] == "finger-spin"
     shutil.copy(fac.data_file("reacher-hard", "replay.npz"), tmp_path)  # beside the expert
     found = last_json(run("agreement", "--model", "student.npz", "--expert", ".",
                           "--episodes", "1", "--states", "8", "--json", cwd=tmp_path))
