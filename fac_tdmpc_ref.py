@@ -2500,8 +2500,8 @@ def report(result, plannings):
             (COMPARED["same_search"], budgets[1], "same_search", "same_search"),
             (f"student, N = {result['num_agents']}, one process{over[1]}", budgets[1], "student",
              "student_in_process"),
-            (f"student, workers beside: {result['plan_workers']}", "", "", "student"),
-            )[:5 if result["plan_workers"] else 4]:
+            (f"student, workers beside: {result['plan_workers']}", "", "",
+             "student" if result["plan_workers"] else "nowhere")):
         if ms := result.get(f"plan_ms_{timed}"):  # or it isn't `compared`
             rows.append((name, budget, f"{result[f'{who}_return_mean']:.0f} ± "
                          f"{result[f'{who}_return_std']:.0f}" if who else "the same plans",

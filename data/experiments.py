@@ -759,11 +759,12 @@ def report_figure8(_, path, figures):
 
 def report_students(_, path, figures):
     """Students as `distill` makes them: the README's main table, all of it, the same search."""
-    rows = [row for own in settled(path, VARIED["students"]).values() for row in own]
-    result, text = students.table(rows, {
+    lines = students.by_line(
+        row for own in settled(path, VARIED["students"]).values() for row in own)
+    result, text = students.table(lines, {
         task: f"{found[1]} / {found[0]}" for task, found in AUTHORS.items()})
-    return result, "\n".join([students.readme_table(rows, result), text,
-                              students.search_table(rows)])
+    return result, "\n".join([students.readme_table(lines, result), text,
+                              students.search_table(lines)])
 
 
 REPORT_HEAD = """# The paper's figures, here

@@ -1,5 +1,4 @@
 """Section 5.6: look into a model: `experiments.py watch`, `figure9` and `agreement` are here."""
-import contextlib
 import functools
 import os
 import subprocess
@@ -187,13 +186,8 @@ def turning_points(returns, count=2):
 
 
 def frames_at(task, seed, actions, moments, action_repeat):
-    """Pictures of an episode, played again, before these decisions; {} where nothing draws."""
-    try:
-        choose_renderer()
-        environment, found = fac.Environment(task, action_repeat, render=True), {}
-    except fac.UserError as error:
-        print(error, file=sys.stderr)
-        return {}
+    """Pictures of an episode, played again, before these decisions, after `choose_renderer`."""
+    environment, found = fac.Environment(task, action_repeat, render=True), {}
     environment.reset(seed)
     for t in range(max(moments) + 1):
         if t in moments:
@@ -204,8 +198,11 @@ def frames_at(task, seed, actions, moments, action_repeat):
 
 def command_figure9(args):
     """figure9: latents by joint, and what each joint contributes in the best and worst episode."""
-    with contextlib.suppress(fac.UserError):  # `frames_at` says it
+    undrawn = None
+    try:
         choose_renderer()  # before a task's sizes are looked up in dm_control
+    except fac.UserError as error:
+        undrawn = error  # said below: what can't be used has one line
     model, header, task = open_model(args, kinds=["student"])
     plt, began = need_plots(args.out), time.time()
     config = fac.PlannerConfig(**fac.made_for(header, args.model))
@@ -229,12 +226,14 @@ def command_figure9(args):
     grid[0, 2].legend(*grid[0, 1].get_legend_handles_labels(), loc="upper left",
                       ncols=1 + len(z) // 8, title=title)
     moments = {}
+    if undrawn:
+        print(undrawn, file=sys.stderr)
     for row, name, episode in zip(grid[1:], ("best", "worst"),
                                   (int(returns.argmax()), int(returns.argmin()))):
         shares = credit(model, obs[episode], actions[episode], config)
         moments[name] = turning_points(shares.sum(0))
         pictures = frames_at(task, seeds[episode], actions[episode], moments[name],
-                             config.action_repeat)
+                             config.action_repeat) if not undrawn else {}
         for share in shares:
             row[0].plot(share - share.mean(), linewidth=1)
         row[0].plot(shares.sum(0) - shares.sum(0).mean(), "k-")

@@ -53,10 +53,14 @@ def returns(row, key="returns"):
     return json.loads(row[key]) if key in row else json.loads(row["ranks"]).get(key, [])
 
 
+def overall(rows, key):
+    """The mean of these returns over episodes and rows."""
+    return np.mean([np.mean(returns(row, key)) for row in rows])
+
+
 def kept(rows, key="returns"):
     """The mean of these returns by the expert's, a ratio of means over rows; NaN: nothing."""
-    found = fac.return_kept(*(np.mean([np.mean(returns(row, of)) for row in rows])
-                              for of in (key, "expert_returns")))
+    found = fac.return_kept(overall(rows, key), overall(rows, "expert_returns"))
     return np.nan if found is None else found
 
 
@@ -113,10 +117,10 @@ def by_line(rows):
     return found
 
 
-def table(rows, authors):
-    """All lines, {line: {head: cell}}, and Markdown. authors: {task: text}."""
+def table(lines, authors):
+    """All lines, {line: {head: cell}}, and Markdown. lines: `by_line`'s; authors: {task: text}."""
     result, last = {}, "authors' logs: 100% TD-MPC / Fac-TDMPC"
-    for line, found in by_line(rows).items():
+    for line, found in lines.items():
         row = sum(found.values(), [])[0]
         policy = returns(row, "policy_returns")
         result[line] = {
@@ -128,36 +132,32 @@ def table(rows, authors):
                             [found.values() for found in result.values()])
 
 
-def overall(rows, key="returns"):
-    """The mean of these returns over seeds and episodes of both evaluation seeds."""
-    return f"{np.mean([np.mean(returns(row, key)) for row in rows]):.0f}"
-
-
-def readme_table(rows, result):
-    """The README's: each task's default, and what its plain preset keeps. result: `table`'s."""
-    lines = []
-    for task, found in by_line(rows).items():
-        own = sum(found.values(), [])
-        if "," not in task and all(returns(row, "policy_returns") for row in own):
-            lines.append([task, result[task]["N"], *(overall(own, key) for key in (
-                "expert_returns", "policy_returns", "returns")), *(
-                    result[task][head] for head in (KEPT, WINS, FASTER)),
-                result.get(f"{task}, plain", {}).get(KEPT, "-")])
+def readme_table(lines, result):
+    """The README's: each task's default, and what its plain preset keeps. Returns are means over
+    seeds and episodes of both evaluation seeds. result: `table`'s."""
+    found = []
+    for task, rows in lines.items():
+        own = sum(rows.values(), [])
+        if task == own[0]["task"] and all(returns(row, "policy_returns") for row in own):
+            means = (overall(own, key) for key in ("expert_returns", "policy_returns", "returns"))
+            found.append([task, result[task]["N"], *(f"{x:.0f}" for x in means),
+                          *(result[task][head] for head in (KEPT, WINS, FASTER)),
+                          result.get(f"{task}, plain", {}).get(KEPT, "-")])
     return markdown(["task", "N", "expert", "its policy alone", "student", KEPT, WINS, FASTER,
-                     "`--preset plain` keeps"], lines)
+                     "`--preset plain` keeps"], found)
 
 
-def search_table(rows):
-    """The expert searching like its student, beside both: mean returns, and milliseconds of a
-    decision in one process."""
+def search_table(lines):
+    """The expert searching like its student, beside both: mean returns as the README's, and
+    milliseconds of a decision in one process."""
     keys = "expert_returns", "policy_returns", "same_search_returns", "returns"
     timed = "expert", "policy", "same_search", "student_in_process"
-    heads, lines = ("the expert", "its policy alone", "the same search", "student"), []
-    for line, found in by_line(rows).items():
-        own = sum(found.values(), [])
-        if all(found.values()) and all(returns(row, key) for row in own for key in keys):
-            ms = [measured(own, lambda x, key=f"plan_ms_{who}": x[key]) for who in timed]
-            lines.append([line, *(overall(own, key) for key in keys),
-                          wins(found, over="same_search_returns"), *(f"{x:.1f}" for x in ms)])
+    heads, found = ("the expert", "its policy alone", "the same search", "student"), []
+    for line, rows in lines.items():
+        own = sum(rows.values(), [])
+        if all(rows.values()) and all(returns(row, key) for row in own for key in keys):
+            ms = (measured(own, lambda x, key=f"plan_ms_{who}": x[key]) for who in timed)
+            found.append([line, *(f"{overall(own, key):.0f}" for key in keys),
+                          wins(rows, over="same_search_returns"), *(f"{x:.1f}" for x in ms)])
     return markdown(["task", *heads, "student - the same search", *(f"ms: {x}" for x in heads)],
-                    lines)
+                    found)
