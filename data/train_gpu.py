@@ -139,7 +139,7 @@ class Learner:
         shape, new = (T, episodes, fac.EPISODE_STEPS), functools.partial(torch.zeros, device=device)
         self.obs = new(T, episodes, fac.EPISODE_STEPS + 1, self.dim_obs)
         self.action, self.reward = new(*shape, self.dim_action), new(*shape)
-        self.filled, self.std = self.tensor(0.0), self.tensor(config.std_start)
+        self.filled, self.std = self.tensor(0.0), new(T, 1, 1)
         self.losses = new(3)
 
     def encode(self, p, obs):
@@ -237,7 +237,7 @@ class Learner:
         proposals = torch.stack(proposals)
         G_proposals = self.returns(p, z.repeat_interleave(P, 1), proposals).view(T, E, P)
         mean, std = mean[:, :, :, None], torch.full_like(mean[:, :, :, None], c.max_std)
-        least, mask = self.std.clamp(min=c.min_std), self.mask[:, :, None]
+        least, mask = self.std[..., None].clamp(min=c.min_std), self.mask[:, :, None]
         starts = z.repeat_interleave(S, 1)
         for _ in range(c.iterations):
             noise = torch.randn(L, T, E, S, A, device=self.device)
@@ -295,6 +295,14 @@ class Learner:
                                       for k, v in params.items()})
 
 
+def started(path, sizes):
+    """(model, what it has learned from) of an expert's file, to be trained further."""
+    model, header = fac.load_model(path, ("expert",))
+    fac.need(model.config == sizes and model.has_policy, f"{path}: expected an expert with a policy "
+             f"and {sizes}, found {model.config}")
+    return model, {key: header.get(key) for key in ("decisions", "updates")}
+
+
 def train(args):
     """Learn for --minutes; returns the result."""
     config = fac.from_args(ExpertConfig, args, **DEFAULTS)
@@ -302,6 +310,8 @@ def train(args):
                              discount=config.discount)
     fac.need(0 < args.minutes < np.inf, f"--minutes: expected above 0, found {args.minutes}")
     fac.need(args.updates % 2 == 0, f"--updates: expected an even number, found {args.updates}")
+    fac.need(len(args.start) <= len(args.tasks), f"--start: expected at most {len(args.tasks)} "
+             f"files, one for each of --tasks, found {len(args.start)}")
     sizes = [fac.ModelConfig(*fac.lookup_task(task)[2:], 1, config.latent_dim, config.enc_dim,
                              config.mlp_dim) for task in args.tasks]
     with fac.optional("PyTorch", "torch"):
@@ -309,14 +319,16 @@ def train(args):
     device = args.device or ("cuda" if torch.cuda.is_available() else "cpu")
     torch.backends.cuda.matmul.allow_tf32 = True
     torch.manual_seed(args.seed)
-    models = [fac.WorldModel.create(size, fac.stream(args.seed, "expert", i), policy=True)
-              for i, size in enumerate(sizes)]
+    before = [started(path, size) for path, size in zip(args.start, sizes)]
+    models = [model for model, _ in before]
+    models += [fac.WorldModel.create(size, fac.stream(args.seed, "expert", i), policy=True)
+               for i, size in enumerate(sizes) if i >= len(models)]
     episodes = max(1, config.buffer_size // fac.EPISODE_STEPS // args.envs) * args.envs
     learner = Learner(models, config, planning, episodes, device, getattr(torch, args.precision))
     with fac.locked(args.out), torch.no_grad(), \
             fac.Workers(playing_worker, args.envs, "playing worker") as workers:
         workers.send_all([(args.tasks, learner.dim_obs)] * args.envs)
-        run = Run(args, config, learner, workers)
+        run = Run(args, config, learner, workers, [history for _, history in before])
         while not run.decisions or run.seconds < 60 * args.minutes:
             run.round()
         return {"tasks": args.tasks, "seed": args.seed, "decisions": run.decisions,
@@ -327,8 +339,9 @@ def train(args):
 class Run:
     """Rounds of --envs episodes of every task, played and learned from."""
 
-    def __init__(self, args, config, learner, workers):
+    def __init__(self, args, config, learner, workers, before):
         self.args, self.config, self.learner, self.workers = args, config, learner, workers
+        self.before = before
         self.began, self.decisions = time.time(), 0
         self.curves = [[] for _ in args.tasks]
         new, (T, E) = learner.torch.zeros, (len(args.tasks), args.envs)
@@ -346,20 +359,22 @@ class Run:
         config, learner = self.config, self.learner
         learner.std.fill_(np.interp(self.decisions, [0, config.std_steps],
                                     [config.std_start, learner.planning.min_std]))
+        learner.std[:len(self.args.start)] = learner.planning.min_std  # these have explored
         done = self.seconds / (60 * self.args.minutes)
         for stack in (learner.main, learner.pi):
             stack.optimizer.param_groups[0]["lr"].fill_(
                 config.lr * np.interp(done, [COOLING, 1], [1, 0.1]))
 
     def round(self):
-        """An episode of each task in every process, in step; learns meanwhile. The first: random.
-        """
+        """An episode of each task in every process, in step; learns meanwhile. The first round:
+        without learning, and with random actions unless some models were trained before."""
         learner, args, torch, steps = self.learner, self.args, self.learner.torch, fac.EPISODE_STEPS
         first, held = self.decisions // steps, learner.obs.shape[1]
         where = slice(first % held, first % held + args.envs)
         self.schedule()
-        if first and self.plan is None:
+        if first and self.learn is None:
             self.learn = learner.graph(torch.enable_grad()(learner.learn))
+        if (first or args.start) and self.plan is None:
             self.plan = learner.graph(self.decide)
         self.mean.zero_()
         seeds = fac.training_seeds(args.seed, "training episode", first * len(args.tasks),
@@ -372,7 +387,7 @@ class Run:
             else:
                 self.chosen.uniform_(-1, 1).mul_(learner.mask)
             actions = learner.sent(self.chosen)
-            if self.plan:  # queued before this waits: the GPU learns while the processes play
+            if first:  # queued before this waits: the GPU learns while the processes play
                 for _ in range(args.updates // 2):
                     self.learn()
                 learner.updates += args.updates
@@ -421,6 +436,8 @@ class Run:
                      "device": learner.device, "precision": args.precision, "envs": args.envs,
                      "training": dataclasses.asdict(self.config),
                      "training_planner": dataclasses.asdict(learner.planning)}
+            if i < len(self.before):
+                about["before"] = self.before[i]
             try:
                 fac.save_model(folder / "expert.npz", model, {"kind": "expert", **about}, True)
             except fac.UserError as error:  # one task's failure is not the others'
@@ -447,6 +464,8 @@ def make_parser():
     positive = functools.partial(natural, least=1)
     add("--tasks", nargs="+", default=list(fac.TASKS), metavar="TASK", help="of: " +
         fac.TASK_NAMES + "; one may be named twice [all]")
+    add("--start", nargs="+", default=[], metavar="EXPERT.NPZ", help="experts to train further, of "
+        "the first --tasks; the others begin anew [all anew]")
     add("--minutes", type=float, default=9, help="how long to learn [9]")
     add("--seed", type=natural, default=0, help="[0]")
     add("--envs", type=positive, default=16, help="processes, and episodes of a task at once [16]")
