@@ -1046,7 +1046,7 @@ class Distiller:
         keep_memory()
         theirs = expert.config
         self.train_starts, self.held_out_starts = replay.starts(config.horizon + 1, config.held_out,
-                                                                seed)
+                                                                count(seed, "seed"))
         need((replay.dim_obs, replay.dim_action) == (theirs.dim_obs, theirs.dim_action),
              f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, {replay.dim_action}), the "
              f"expert expects ({theirs.dim_obs}, {theirs.dim_action}); pass its own task's replay")
@@ -1523,8 +1523,8 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
         with one_thread():
             z = self.model.encode(obs)
             if self.config.prior == "policy":
-                prior = policy_plan(self._teacher, obs, self.config.horizon + 1,
-                                    self.model.config)[..., 0]
+                steps = 1 + self.config.horizon * bool(self.config.iterations)
+                prior = policy_plan(self._teacher, obs, steps, self.model.config)[..., 0]
             tasks = [(z[part], prior if prior is None else prior[part]) for part in self._parts]
             try:
                 self._workers.send_all(tasks[1:])
@@ -1951,10 +1951,11 @@ def load_model(path, kinds=("expert", "student")):
 
 def made_for(header, where):
     """What a model's file was trained, or distilled, for, as settings of a PlannerConfig: discount,
-    horizon, action repeat and SEARCH, those that it names. The one place that reads them."""
+    horizon, action repeat (the header's own) and SEARCH, those that it names. The one place that
+    reads them."""
     found, there = {}, f"{where}: header"
     for group, names in (("training", ("discount", "horizon")), ("distill", ("horizon",)),
-                         ("planner", SEARCH)):
+                         ("planner", ("discount", "horizon", *SEARCH))):
         settings = header.get(group) or {}
         need(isinstance(settings, dict), f"{there}: {group}: expected settings, found "
              f"{settings!r}")
@@ -1971,7 +1972,8 @@ def check_rows(name, rows, most=None):
     """UserError names the first of rows (M, F) with a value that isn't finite, or above `most`."""
     for i, j in np.argwhere(~(np.abs(rows) <= (most or np.finfo(rows.dtype).max)))[:1]:
         wrong = "outside [-1, 1]" if np.isfinite(rows[i, j]) else "not finite"
-        raise UserError(f"{name}: row {i}, column {j}: {rows[i, j]} is {wrong}; mend or drop it")
+        raise UserError(f"{name}: row {i}, column {j}: {rows[i, j]} is {wrong}; mend it, or leave "
+                        "out its whole episode")
 
 
 class Replay:
@@ -2323,7 +2325,7 @@ def record_key(model, config, seed):
 
 
 def software():
-    """The versions of what returns depend on beside weights and settings."""
+    """The versions of what returns depend on beside weights and settings (not Gymnasium's)."""
     return {"fac-tdmpc-ref": __version__, "numpy": np.__version__,
             "mujoco": importlib.metadata.version("mujoco")}
 
@@ -2511,8 +2513,9 @@ def report(result, plannings):
         "by_step", "returns", "returns_training", "returns_se"))
     kept = "-" if result["kept"] is None else f"{result['kept']:.2f}"
     print(f"\nreturn kept {kept}, rank correlation of Q {q[0]:.3f} (h = 0) to {q[-1]:.3f} (h = "
-          f"{len(q) - 1}), of the return {g[-1]:.3f}" + (f" ± {error[-1]:.3f}" if error else "") +
-          f" (standard error over {result['rank_correlation_episodes']} held-out episodes; "
+          f"{len(q) - 1}), of the return {g[-1]:.3f} (" + (
+              f"± {error[-1]:.3f}, standard error over {result['rank_correlation_episodes']} "
+              "held-out episodes; " if error else "") +
           f"{known[-1]:.3f} in states of training), distilled in {result['seconds']:.0f} s, "
           f"{result['seconds_total']:.0f} s in all, {result['out']}/")
 
@@ -2533,7 +2536,10 @@ def command_evaluate(args):
     """evaluate: a model's returns on a task."""
     model, header = load_model(args.model)
     task = args.task or header.get("task")
-    planning = from_args(PlannerConfig, args, **made_for({**header, "task": task}, args.model))
+    own = made_for({**header, "task": task}, args.model)
+    if getattr(args, "PlannerConfig.prior") == "none" and own.get("prior") == "policy":
+        own = {name: value for name, value in own.items() if name not in SEARCH}  # around it
+    planning = from_args(PlannerConfig, args, **own)
     need(task, f"{args.model}: header: no task; pass --task")
     need(task == header.get("task") or not args.record, f"{args.model}: header: task: expected "
          f"{task!r} to record its returns, found {header.get('task')!r}")
@@ -2656,7 +2662,8 @@ def make_parser():
     add("--record", action="store_true", help="keep them in a .json beside the model, for distill")
     add("--episodes", type=positive, default=20, help="[20]")
     add("--workers", type=natural, help="processes that play episodes; 0: this one [cores]")
-    add_config(sub, PlannerConfig, skip=("action_repeat",))
+    add_config(sub, PlannerConfig, "MPPI; a student plans as its file says, unless --prior is none",
+               skip=("action_repeat",))
     return parser
 
 
@@ -2683,7 +2690,7 @@ def run_command(parser, argv=None):
         return 2
     except KeyboardInterrupt:
         print(f"{parser.prog}: interrupted; the same command goes on from its last checkpoint, "
-              f"if it had one", file=sys.stderr)
+              "where it keeps one (--plain: anew)", file=sys.stderr)
         return 130
     return 1 if result and result.get("failed") else 0  # an experiment's runs
 

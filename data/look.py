@@ -26,12 +26,15 @@ def choose_renderer():
                         "OSMesa (libosmesa6)")
 
 
-def shares(model, z, config):
-    """What a plan that each agent makes anew from z (N, m, 1) is worth above doing nothing (N,)."""
+def shares(model, z, config, obs=None):
+    """What a plan that each agent makes anew from z (N, m, 1) is worth above doing nothing (N,).
+    obs (O, 1): what z is of, where plans start from the expert's policy [D9]."""
     n = model.config.num_agents
     returns = functools.partial(fac.h_step_return, model, z, config=config)
     nothing = np.zeros((n, config.horizon + 1, model.config.agent_actions), fac.F32)
-    plan, _, _ = fac.mppi(returns, nothing, config, [np.random.default_rng(0) for _ in range(n)])
+    first = fac.policy_plan(fac.teacher_of(model, config), obs, config.horizon + 1, model.config)[
+        ..., 0] if config.prior == "policy" else nothing
+    plan, _, _ = fac.mppi(returns, first, config, [np.random.default_rng(0) for _ in range(n)])
     worth = returns(np.stack([plan, nothing], -1))
     return worth[:, 0] - worth[:, 1]
 
@@ -45,8 +48,8 @@ def watch_episode(path, model, header, task, seed, decisions, every):
     obs, actions, rewards, seconds = (x[0] for x in fac.play(
         model, task, config, [seed], label=f"playing {path}", environment=environment))
     pictures = frames_at(task, seed, actions, range(0, decisions, every), config.action_repeat)
-    frames = [(picture, shares(model, model.encode(obs[t][:, None]), config), rewards[:t].sum())
-              for t, picture in pictures.items()]
+    frames = [(picture, shares(model, model.encode(seen), config, seen), rewards[:t].sum())
+              for t, picture in pictures.items() for seen in [obs[t][:, None]]]
     name = f"{header['kind']}, N = {model.config.num_agents}"
     return frames, name, 1e3 * float(np.median(seconds)), float(rewards.sum())
 

@@ -175,12 +175,12 @@ def command_distill(args):
 
 # ---------------------------------------------------------------------------------- evaluate
 
-def recorded(expert, header, path, episodes, seed):
-    """The returns of an expert's episodes: those in its record; else measured, in this process."""
+def recorded(expert, header, path, episodes, seed, workers=0):
+    """The returns of an expert's episodes: those in its record; else measured."""
     planning = fac.PlannerConfig(**fac.made_for(header, path))
     found, _ = fac.recorded_returns(path, expert, planning, seed)
     return found[:episodes] if len(found) >= episodes else fac.evaluate(
-        expert, header["task"], planning, episodes, seed, 0, "evaluating the teacher")["returns"]
+        expert, header["task"], planning, episodes, seed, workers, "evaluating the teacher")["returns"]
 
 
 def command_evaluate(args):
@@ -201,15 +201,18 @@ def command_evaluate(args):
             **(fac.STUDENT_PLANNING if around else {})})
         found[task] = fac.evaluate(student.of_task(task, expert), task, planning, args.episodes,
                                    args.seed, args.workers, task)
-        found[task]["teacher_returns"] = recorded(expert, own, path, args.episodes, args.seed)
+        found[task]["teacher_returns"] = recorded(expert, own, path, args.episodes, args.seed,
+                                                  args.workers)
     rows = [[np.mean(of["returns"]), np.mean(of["teacher_returns"]), of["plan_ms_median"]]
             for of in found.values()]
     mean, teachers, _ = means = np.mean(rows, 0).tolist()
     spread = [f" ± {np.std(of['returns']):.0f}" for of in found.values()]
+    kept = ["-" if (share := fac.return_kept(*row[:2])) is None else f"{share:.2f}"
+            for row in [*rows, means]]
     fac.print_table([("task", "student", "teacher", "kept", "ms a decision"), *(
-        (task, f"{student:.0f}{std}", f"{teacher:.0f}", f"{student / max(teacher, 1e-9):.2f}",
-         f"{ms:.1f}") for task, std, (student, teacher, ms) in zip(
-            [*found, "mean"], [*spread, ""], [*rows, means]))])
+        (task, f"{student:.0f}{std}", f"{teacher:.0f}", share, f"{ms:.1f}")
+        for task, std, share, (student, teacher, ms) in zip(
+            [*found, "mean"], [*spread, ""], kept, [*rows, means]))])
     return {"tasks": found, "episodes": args.episodes, "seed": args.seed, "return_mean": mean,
             "teacher_mean": teachers, "kept": fac.return_kept(mean, teachers)}
 
@@ -402,7 +405,8 @@ def make_parser():
     option("--episodes", type=positive, default=5, help="of each evaluation [5]")
     option("--jobs", type=positive, default=fac.cores(),
            help="tasks that are played at a time [one for each core]")
-    option("--students", default="runs/figure10", help="leave them in SEED/ there [%(default)s]")
+    option("--students", default="runs/figure10", help="leave them in SEED/ there; other tasks or "
+           "settings need another folder [%(default)s]")
     option("--out", help="the CSV [data/results/figure10.csv]")
     option("--picture", default=str(fac.DATA / "figures" / "figure10.png"), help="beside it "
            "FIGURE-latents.png [data/figures/figure10.png]")

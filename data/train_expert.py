@@ -582,6 +582,8 @@ def read_settings(args):
     fac.need(args.steps and args.steps % quota == 0, f"--envs {args.envs} needs --steps of whole "
              f"rounds of {quota}, not {args.steps}")
     fac.need(args.student or args.num_agents is None, "--num-agents needs --student")
+    fac.need(distilling.encoder_input == "latent" or not distilling.policy_share,
+             "--distill-encoder-input observation needs --distill-policy-share 0")
     for name, default in TORCH_ONLY.items():
         fac.need(args.backend == "torch" or getattr(args, name) == default,
                  f"--{name} needs --backend torch")

@@ -295,12 +295,15 @@ class Learner:
                                       for k, v in params.items()})
 
 
-def started(path, sizes):
+def started(path, task, sizes):
     """(model, what it has learned from) of an expert's file, to be trained further."""
     model, header = fac.load_model(path, ("expert",))
+    found = header.get("task"), fac.made_for(header, path).get("action_repeat", fac.ACTION_REPEAT)
+    fac.need(found == (task, fac.ACTION_REPEAT), f"{path}: header: task, action_repeat: expected "
+             f"{(task, fac.ACTION_REPEAT)}, found {found}")
     fac.need(model.config == sizes and model.has_policy, f"{path}: expected an expert with a policy "
              f"and {sizes}, found {model.config}")
-    return model, {key: header.get(key) for key in ("decisions", "updates")}
+    return model, {key: header[key] for key in ("decisions", "updates", "before") if key in header}
 
 
 def train(args):
@@ -310,16 +313,19 @@ def train(args):
                              discount=config.discount)
     fac.need(0 < args.minutes < np.inf, f"--minutes: expected above 0, found {args.minutes}")
     fac.need(args.updates % 2 == 0, f"--updates: expected an even number, found {args.updates}")
+    fac.need(planning.iterations, "--plan-iterations: expected at least 1, found 0")
     fac.need(len(args.start) <= len(args.tasks), f"--start: expected at most {len(args.tasks)} "
              f"files, one for each of --tasks, found {len(args.start)}")
     sizes = [fac.ModelConfig(*fac.lookup_task(task)[2:], 1, config.latent_dim, config.enc_dim,
                              config.mlp_dim) for task in args.tasks]
     with fac.optional("PyTorch", "torch"):
         import torch
-    device = args.device or ("cuda" if torch.cuda.is_available() else "cpu")
+    there = torch.cuda.is_available()
+    device = args.device or ("cuda" if there else "cpu")
+    fac.need(there or device == "cpu", "--device cuda: PyTorch finds no GPU here")
     torch.backends.cuda.matmul.allow_tf32 = True
     torch.manual_seed(args.seed)
-    before = [started(path, size) for path, size in zip(args.start, sizes)]
+    before = [started(*of) for of in zip(args.start, args.tasks, sizes)]
     models = [model for model, _ in before]
     models += [fac.WorldModel.create(size, fac.stream(args.seed, "expert", i), policy=True)
                for i, size in enumerate(sizes) if i >= len(models)]
@@ -327,13 +333,16 @@ def train(args):
     learner = Learner(models, config, planning, episodes, device, getattr(torch, args.precision))
     with fac.locked(args.out), torch.no_grad(), \
             fac.Workers(playing_worker, args.envs, "playing worker") as workers:
+        found = next(Path(args.out).glob("*/expert.npz"), None)
+        fac.need(not found, f"{found}: another run's; choose another --out")
         workers.send_all([(args.tasks, learner.dim_obs)] * args.envs)
         run = Run(args, config, learner, workers, [history for _, history in before])
         while not run.decisions or run.seconds < 60 * args.minutes:
             run.round()
         return {"tasks": args.tasks, "seed": args.seed, "decisions": run.decisions,
                 "updates": learner.updates, "seconds": round(run.seconds, 1),
-                "returns": [curve[-1][3] for curve in run.curves], "out": run.save(args.out)}
+                "returns": [curve[-1][3] for curve in run.curves], "out": args.out,
+                "failed": run.save(args.out)}
 
 
 class Run:
@@ -423,8 +432,8 @@ class Run:
         self.mean.copy_(mean)
 
     def save(self, out):
-        """A folder for each task; returns `out`."""
-        learner, args, held = self.learner, self.args, int(self.learner.filled)
+        """A folder for each task; returns how many models are not finite, and have none."""
+        learner, args, held, failed = self.learner, self.args, int(self.learner.filled), 0
         count = min(args.replay, held)
         for i, (task, curve) in enumerate(zip(args.tasks, self.curves)):
             folder = Path(out) / (task if args.tasks.count(task) == 1 else f"{task}-{i}")
@@ -434,7 +443,8 @@ class Run:
                      "updates": learner.updates, "action_repeat": fac.ACTION_REPEAT,
                      "backend": "torch", "torch": learner.torch.__version__,
                      "device": learner.device, "precision": args.precision, "envs": args.envs,
-                     "training": dataclasses.asdict(self.config),
+                     "training": {key: value for key, value in vars(self.config).items()
+                                  if key not in SKIPPED},
                      "training_planner": dataclasses.asdict(learner.planning)}
             if i < len(self.before):
                 about["before"] = self.before[i]
@@ -442,9 +452,10 @@ class Run:
                 fac.save_model(folder / "expert.npz", model, {"kind": "expert", **about}, True)
             except fac.UserError as error:  # one task's failure is not the others'
                 print(error, file=sys.stderr)
+                failed += 1
                 continue
             episodes = ReplayBuffer(model.config.dim_obs, model.config.dim_action,
-                                    args.replay * fac.EPISODE_STEPS)
+                                    count * fac.EPISODE_STEPS)
             for j in np.arange(count) * held // count:
                 obs, action, reward = (x[i, j].cpu().numpy() for x in (
                     learner.obs, learner.action, learner.reward))
@@ -452,7 +463,7 @@ class Run:
                              reward)
             episodes.write(folder / "replay.npz", about)
             fac.write_curve(folder / "curve.csv", CURVE, curve)
-        return str(out)
+        return failed
 
 
 def make_parser():
@@ -462,8 +473,8 @@ def make_parser():
                         "what distill takes as --expert.")
     add, natural = parser.add_argument, fac.natural
     positive = functools.partial(natural, least=1)
-    add("--tasks", nargs="+", default=list(fac.TASKS), metavar="TASK", help="of: " +
-        fac.TASK_NAMES + "; one may be named twice [all]")
+    add("--tasks", nargs="+", default=list(fac.TASKS), metavar="TASK", help="of "
+        "dm_control's suite; one may be named twice [the paper's]")
     add("--start", nargs="+", default=[], metavar="EXPERT.NPZ", help="experts to train further, of "
         "the first --tasks; the others begin anew [all anew]")
     add("--minutes", type=float, default=9, help="how long to learn [9]")
@@ -471,7 +482,7 @@ def make_parser():
     add("--envs", type=positive, default=16, help="processes, and episodes of a task at once [16]")
     add("--updates", type=positive, default=8, help="updates while each of them takes a decision, "
         "an even number [8]")
-    add("--device", help="cpu or cuda [cuda where there is one]")
+    add("--device", choices=("cpu", "cuda"), help="[cuda where there is one]")
     add("--precision", choices=("float32", "bfloat16"), default="bfloat16", help="of hidden "
         "layers' products but the encoder's [bfloat16]")
     add("--replay", type=positive, default=60, help="episodes in replay.npz, spread evenly over "

@@ -454,6 +454,11 @@ def test_who_finds_better_plans_far_away_searches_widely(
     for found in (result, header["planner"], *planned):
         assert tuple(found[name] for name in ("max_std", "samples", "iterations")) == expected
     assert [vars(fac.PlannerConfig(**fac.made_for(header, "student")))] == planned  # as evaluate
+    monkeypatch.setattr(fac, "evaluate", lambda model, task, planning, *_: (
+        planned.append(planning), {"returns": [0.0], "plan_ms_median": 0.0})[1])
+    fac.main(["evaluate", "--model", str(tmp_path / "out" / "student.npz"), "--prior", "none"])
+    sizes = planned[-1].max_std, planned[-1].samples, planned[-1].iterations, planned[-1].output
+    assert sizes == ((*expected, "sampled") if gain is None else (2.0, 128, 4, "sampled"))
     wider = gain and float(gain * (expected[0] < 2))  # than what the flags say
     assert result["wide_search_gain"] == (gain and [wider, 0.0])
 

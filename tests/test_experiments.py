@@ -1158,6 +1158,15 @@ def test_shares_are_each_agent_s_own():
     np.testing.assert_allclose(found, alone, rtol=1e-4)
 
 
+def test_shares_are_of_plans_that_start_as_the_model_s_do():
+    """Around its policy, with hardly any width: what the policy's rollout is worth."""
+    model, obs = random_model(1, policy=True), np.full((8, 1), 0.3, np.float32)
+    config = fac.PlannerConfig(prior="policy", min_std=1e-6, max_std=1e-6, horizon=2)
+    plan, z = fac.policy_plan(model, obs, 3, model.config), model.encode(obs)
+    worth = fac.h_step_return(model, z, np.concatenate([plan, 0 * plan], -1), config)[0]
+    np.testing.assert_allclose(look.shares(model, z, config, obs), worth[:1] - worth[1:], rtol=1e-3)
+
+
 def test_frames_hold_pictures_and_bars():
     pytest.importorskip("PIL")
     size, shares = look.PIXELS, np.array([1.0, -0.5])

@@ -435,6 +435,7 @@ def test_another_run_s_files_are_not_replaced(tmp_path, name):
     (["--std-start", "3"], ["std_start", "2.0"]),
     (["--student", "fac", "--plan-min-std", "0.2"], ["min_std", "0.15"]),
     (["--distill-batch-size", "9"], ["--distill-batch-size 9", "at most", "(8)"]),
+    (["--distill-encoder-input", "observation"], ["--distill-policy-share 0"]),
     (["--out", fac.__file__], ["can't be read or written"]),
     (["--out", "x" * 300], ["can't be read or written"]),
     (["--evaluate-every", "0"], ["evaluate"]),

@@ -127,7 +127,20 @@ def test_an_expert_trained_further(tmp_path, capsys):
     for name, value in one.params.items():
         np.testing.assert_allclose(value, models()[0].params[name], rtol=1e-3, atol=1e-6)
     assert "before" not in fac.load_model(out / "ball_in_cup-catch" / "expert.npz")[1]
-    for wrong, message in (([str(path)] * 3, "--start: expected at most 2"),
-                           ([str(path), str(path)], "expected an expert with a policy and Model")):
-        assert train_gpu.main([*small, "--start", *wrong]) == 2
+    for wrong, message in ((["--start", *[str(path)] * 3], "--start: expected at most 2"),
+                           (["--start", str(path), str(path)], "expected ('ball_in_cup-catch', 2)"),
+                           (["--start", str(path), "--mlp-dim", "8"], "an expert with a policy and"),
+                           (["--plan-iterations", "0"], "at least 1"), ([], "another run's")):
+        assert train_gpu.main([*small, *wrong]) == 2
         assert message in capsys.readouterr().err
+
+
+def test_a_model_that_diverged_counts_as_failed(tmp_path, monkeypatch, capsys):
+    def save(path, model, *_):
+        raise fac.UserError(f"{path}: would hold values that are not finite")
+
+    monkeypatch.setattr(fac, "save_model", save)
+    assert train_gpu.main(["--tasks", "ball_in_cup-catch", "--device", "cpu", "--envs", "1",
+                           "--minutes", "0.001", "--mlp-dim", "8", "--enc-dim", "8", "--json",
+                           "--out", str(tmp_path)]) == 1
+    assert '"failed": 1' in capsys.readouterr().out
