@@ -180,7 +180,8 @@ def recorded(expert, header, path, episodes, seed, workers=0):
     planning = fac.PlannerConfig(**fac.made_for(header, path))
     found, _ = fac.recorded_returns(path, expert, planning, seed)
     return found[:episodes] if len(found) >= episodes else fac.evaluate(
-        expert, header["task"], planning, episodes, seed, workers, "evaluating the teacher")["returns"]
+        expert, header["task"], planning, episodes, seed, workers,
+        "evaluating the teacher")["returns"]
 
 
 def command_evaluate(args):

@@ -299,11 +299,12 @@ def started(path, task, sizes):
     """(model, what it has learned from) of an expert's file, to be trained further."""
     model, header = fac.load_model(path, ("expert",))
     found = header.get("task"), fac.made_for(header, path).get("action_repeat", fac.ACTION_REPEAT)
-    fac.need(found == (task, fac.ACTION_REPEAT), f"{path}: header: task, action_repeat: expected "
-             f"{(task, fac.ACTION_REPEAT)}, found {found}")
-    fac.need(model.config == sizes and model.has_policy, f"{path}: expected an expert with a policy "
-             f"and {sizes}, found {model.config}")
-    return model, {key: header[key] for key in ("decisions", "updates", "before") if key in header}
+    expected = task, fac.ACTION_REPEAT
+    fac.need(found == expected,
+             f"{path}: header: task, action_repeat: expected {expected}, found {found}")
+    fac.need(model.config == sizes and model.has_policy,
+             f"{path}: expected an expert with a policy and {sizes}, found {model.config}")
+    return model, {k: header[k] for k in ("decisions", "updates", "before") if k in header}
 
 
 def train(args):

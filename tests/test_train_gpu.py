@@ -129,7 +129,7 @@ def test_an_expert_trained_further(tmp_path, capsys):
     assert "before" not in fac.load_model(out / "ball_in_cup-catch" / "expert.npz")[1]
     for wrong, message in ((["--start", *[str(path)] * 3], "--start: expected at most 2"),
                            (["--start", str(path), str(path)], "expected ('ball_in_cup-catch', 2)"),
-                           (["--start", str(path), "--mlp-dim", "8"], "an expert with a policy and"),
+                           (["--start", str(path), "--mlp-dim", "8"], "an expert with a policy"),
                            (["--plan-iterations", "0"], "at least 1"), ([], "another run's")):
         assert train_gpu.main([*small, *wrong]) == 2
         assert message in capsys.readouterr().err
