@@ -108,20 +108,25 @@ def test_returns_and_plans_are_the_planner_s(learner):
                 G[i, e], fac.h_step_return(model, z[..., e:e + 1], own, PLANNING)[0, 0], rtol=2e-4)
 
 
-def test_an_expert_trained_further(tmp_path, capsys):
-    """A first round, in which nothing is learned: weights are the file's, rounded to float16, and
-    its header says what they had learned from; the other task's model is new."""
+def test_an_expert_trained_further(tmp_path, capsys, monkeypatch):
+    """A first round, in which nothing is learned and all plan, the new model with noise: weights
+    are the file's, rounded to float16, and its header says what they had learned from."""
+    plan, widths = train_gpu.Learner.plan, []
+    monkeypatch.setattr(train_gpu.Learner, "plan", lambda self, *given: (
+        widths.append(self.std.flatten().tolist()), plan(self, *given))[1])
     path, out = tmp_path / "expert.npz", tmp_path / "out"
     fac.save_model(path, models()[0], {"kind": "expert", "task": TASKS[0], "decisions": 7,
                                        "updates": 3})
     small = ["--tasks", TASKS[0], "ball_in_cup-catch", "--device", "cpu", "--envs", "1",
-             "--updates", "2", "--minutes", "0.02", "--precision", "float32", "--out", str(out),
+             "--updates", "2", "--minutes", "0.001", "--precision", "float32", "--out", str(out),
              "--plan-samples", "4", "--plan-iterations", "1", "--plan-pi-trajs", "1",
              "--replay", "1"] + [
         x for name in ("mlp_dim", "enc_dim", "latent_dim", "batch_size")
         for x in ("--" + name.replace("_", "-"), str(getattr(CONFIG, name)))]
     assert train_gpu.main([*small, "--start", str(path), "--json"]) == 0
     assert '"decisions": 500' in capsys.readouterr().out.splitlines()[-1]
+    assert len(widths) == 500
+    np.testing.assert_allclose(widths[0], [PLANNING.min_std, CONFIG.std_start])
     one, header = fac.load_model(out / TASKS[0] / "expert.npz")
     assert header["before"] == {"decisions": 7, "updates": 3} and header["updates"] == 0
     for name, value in one.params.items():
