@@ -1265,8 +1265,7 @@ def rank_results(distiller, states, discount):
     q, g = rank_by_state(distiller, rows, discount, rng)
     known = rng.choice(distiller.train_starts, states)
     episodes = np.searchsorted(distiller.replay.ends, rows)
-    return {"rank_correlation": float(q[0].mean()),
-            "rank_correlation_by_step": q.mean(1).tolist(),
+    return {"rank_correlation": float(q[0].mean()), "rank_correlation_by_step": q.mean(1).tolist(),
             "rank_correlation_returns": g.mean(1).tolist(),
             "rank_correlation_returns_se": standard_error(g, episodes),
             "rank_correlation_returns_training": rank_by_state(distiller, known, discount, rng)[
@@ -1951,8 +1950,7 @@ def load_model(path, kinds=("expert", "student")):
 
 def made_for(header, where):
     """What a model's file was trained, or distilled, for, as settings of a PlannerConfig: discount,
-    horizon, action repeat (the header's own) and SEARCH, those that it names. The one place that
-    reads them."""
+    horizon, SEARCH and the header's action repeat, where it names them. Nothing else reads them."""
     found, there = {}, f"{where}: header"
     for group, names in (("training", ("discount", "horizon")), ("distill", ("horizon",)),
                          ("planner", ("discount", "horizon", *SEARCH))):
@@ -1972,8 +1970,7 @@ def check_rows(name, rows, most=None):
     """UserError names the first of rows (M, F) with a value that isn't finite, or above `most`."""
     for i, j in np.argwhere(~(np.abs(rows) <= (most or np.finfo(rows.dtype).max)))[:1]:
         wrong = "outside [-1, 1]" if np.isfinite(rows[i, j]) else "not finite"
-        raise UserError(f"{name}: row {i}, column {j}: {rows[i, j]} is {wrong}; mend it, or leave "
-                        "out its whole episode")
+        raise UserError(f"{name}: row {i}, column {j}: {rows[i, j]} is {wrong}; drop its episode")
 
 
 class Replay:
@@ -2336,8 +2333,7 @@ def recorded_returns(path, model, config, seed):
 
 
 def record_returns(path, model, config, seed, returns):
-    """Keep the returns that `evaluate` gave beside the model's file, unless it holds more, of the
-    same versions."""
+    """Keep `evaluate`'s returns beside the model's file, unless it has more of these versions."""
     records, key = read_records(path), record_key(model, config, seed)
     before, of = records.get(key, ([], {}))
     if len(returns) >= len(before) or of != software():
@@ -2459,10 +2455,9 @@ def evaluate_both(expert, student, path, args):
                 model, args.task, planning, args.episodes, args.eval_seed, args.workers,
                 f"evaluating {COMPARED[name]}")["returns"]
         returns = returns[:args.episodes]
-        found.update({f"{name}_{key}": value for key, value in {
-            "returns": returns, "return_mean": float(np.mean(returns)), "return_std": float(
-                np.std(returns)), "horizon": planning.horizon, "recorded": recorded,
-            "versions": versions}.items()})
+        found.update({f"{name}_{key}": x for key, x in {"recorded": recorded, "versions": versions,
+            "returns": returns, "return_mean": float(np.mean(returns)), "horizon": planning.horizon,
+            "return_std": float(np.std(returns))}.items()})
     return {**found, "kept": return_kept(found["student_return_mean"], found["expert_return_mean"])}
 
 
@@ -2509,15 +2504,14 @@ def report(result, plannings):
                          f"{result[f'{who}_return_std']:.0f}" if who else "the same plans",
                          f"{ms:.1f}", f"{result['plan_ms_expert'] / ms:.1f}"))
     print_table(rows)
-    q, g, known, error = (result[f"rank_correlation_{key}"] for key in (
-        "by_step", "returns", "returns_training", "returns_se"))
+    q, g, known, error, held = (result[f"rank_correlation_{key}"] for key in (
+        "by_step", "returns", "returns_training", "returns_se", "episodes"))
+    error = f"± {error[-1]:.3f}, standard error over {held} held-out episodes; " if error else ""
     kept = "-" if result["kept"] is None else f"{result['kept']:.2f}"
     print(f"\nreturn kept {kept}, rank correlation of Q {q[0]:.3f} (h = 0) to {q[-1]:.3f} (h = "
-          f"{len(q) - 1}), of the return {g[-1]:.3f} (" + (
-              f"± {error[-1]:.3f}, standard error over {result['rank_correlation_episodes']} "
-              "held-out episodes; " if error else "") +
-          f"{known[-1]:.3f} in states of training), distilled in {result['seconds']:.0f} s, "
-          f"{result['seconds_total']:.0f} s in all, {result['out']}/")
+          f"{len(q) - 1}), of the return {g[-1]:.3f} ({error}{known[-1]:.3f} in training states), "
+          f"distilled in {result['seconds']:.0f} s, {result['seconds_total']:.0f} s in all, "
+          f"{result['out']}/")
 
 
 def return_kept(student, expert):
@@ -2662,8 +2656,7 @@ def make_parser():
     add("--record", action="store_true", help="keep them in a .json beside the model, for distill")
     add("--episodes", type=positive, default=20, help="[20]")
     add("--workers", type=natural, help="processes that play episodes; 0: this one [cores]")
-    add_config(sub, PlannerConfig, "MPPI; a student plans as its file says, unless --prior is none",
-               skip=("action_repeat",))
+    add_config(sub, PlannerConfig, "MPPI; a student's file has its own", skip=("action_repeat",))
     return parser
 
 
