@@ -2455,9 +2455,10 @@ def evaluate_both(expert, student, path, args):
                 model, args.task, planning, args.episodes, args.eval_seed, args.workers,
                 f"evaluating {COMPARED[name]}")["returns"]
         returns = returns[:args.episodes]
-        found.update({f"{name}_{key}": x for key, x in {"recorded": recorded, "versions": versions,
-            "returns": returns, "return_mean": float(np.mean(returns)), "horizon": planning.horizon,
-            "return_std": float(np.std(returns))}.items()})
+        about = {"returns": returns, "return_mean": float(np.mean(returns)),
+                 "return_std": float(np.std(returns)), "horizon": planning.horizon,
+                 "recorded": recorded, "versions": versions}
+        found.update({f"{name}_{key}": value for key, value in about.items()})
     return {**found, "kept": return_kept(found["student_return_mean"], found["expert_return_mean"])}
 
 
@@ -2506,12 +2507,11 @@ def report(result, plannings):
     print_table(rows)
     q, g, known, error, held = (result[f"rank_correlation_{key}"] for key in (
         "by_step", "returns", "returns_training", "returns_se", "episodes"))
-    error = f"± {error[-1]:.3f}, standard error over {held} held-out episodes; " if error else ""
+    spread = f"± {error[-1]:.3f}, standard error over {held} held-out episodes; " if error else ""
     kept = "-" if result["kept"] is None else f"{result['kept']:.2f}"
     print(f"\nreturn kept {kept}, rank correlation of Q {q[0]:.3f} (h = 0) to {q[-1]:.3f} (h = "
-          f"{len(q) - 1}), of the return {g[-1]:.3f} ({error}{known[-1]:.3f} in training states), "
-          f"distilled in {result['seconds']:.0f} s, {result['seconds_total']:.0f} s in all, "
-          f"{result['out']}/")
+          f"{len(q) - 1}), of the return {g[-1]:.3f} ({spread}{known[-1]:.3f} in training states), "
+          + "distilled in {seconds:.0f} s, {seconds_total:.0f} s in all, {out}/".format_map(result))
 
 
 def return_kept(student, expert):

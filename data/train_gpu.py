@@ -327,15 +327,14 @@ def train(args):
     torch.backends.cuda.matmul.allow_tf32 = True
     torch.manual_seed(args.seed)
     before = [started(*of) for of in zip(args.start, args.tasks, sizes)]
-    models = [model for model, _ in before]
-    models += [fac.WorldModel.create(size, fac.stream(args.seed, "expert", i), policy=True)
-               for i, size in enumerate(sizes) if i >= len(models)]
+    held = next(Path(args.out).glob("*/expert.npz"), None)
+    fac.need(not held, f"{held}: another run's; choose another --out")
+    models = [before[i][0] if i < len(before) else fac.WorldModel.create(
+        size, fac.stream(args.seed, "expert", i), policy=True) for i, size in enumerate(sizes)]
     episodes = max(1, config.buffer_size // fac.EPISODE_STEPS // args.envs) * args.envs
     learner = Learner(models, config, planning, episodes, device, getattr(torch, args.precision))
     with fac.locked(args.out), torch.no_grad(), \
             fac.Workers(playing_worker, args.envs, "playing worker") as workers:
-        found = next(Path(args.out).glob("*/expert.npz"), None)
-        fac.need(not found, f"{found}: another run's; choose another --out")
         workers.send_all([(args.tasks, learner.dim_obs)] * args.envs)
         run = Run(args, config, learner, workers, [history for _, history in before])
         while not run.decisions or run.seconds < 60 * args.minutes:
@@ -369,7 +368,7 @@ class Run:
         config, learner = self.config, self.learner
         learner.std.fill_(np.interp(self.decisions, [0, config.std_steps],
                                     [config.std_start, learner.planning.min_std]))
-        learner.std[:len(self.args.start)] = learner.planning.min_std  # these have explored
+        learner.std[:len(self.before)] = learner.planning.min_std  # these have explored
         done = self.seconds / (60 * self.args.minutes)
         for stack in (learner.main, learner.pi):
             stack.optimizer.param_groups[0]["lr"].fill_(
@@ -384,7 +383,7 @@ class Run:
         self.schedule()
         if first and self.learn is None:
             self.learn = learner.graph(torch.enable_grad()(learner.learn))
-        if (first or args.start) and self.plan is None:
+        if (first or self.before) and self.plan is None:
             self.plan = learner.graph(self.decide)
         self.mean.zero_()
         seeds = fac.training_seeds(args.seed, "training episode", first * len(args.tasks),
