@@ -2151,17 +2151,17 @@ def progress(label, total, unit, initial=0):
 
 
 def interleaved_seconds(calls, rounds, label):
-    """Seconds of functions that are called in turn, so that noise hits all alike: (rounds, calls),
-    without a first round. One BLAS thread leaves cores to workers."""
-    seconds = np.zeros((rounds + 1, len(calls)))
-    with one_thread(), progress(label, rounds + 1, "round") as bar:
-        for row in seconds:
-            for i, call in enumerate(calls):
-                begin = time.perf_counter()
-                call()
-                row[i] = time.perf_counter() - begin
+    """Seconds (rounds, calls) of functions called in turn, so that noise hits all alike: of each a
+    second call, which finds weights in the cache, as a robot's next decision does; one thread."""
+    seconds = np.zeros((rounds, len(calls)))
+    with one_thread(), progress(label, seconds.size, "call") as bar:
+        for i, j in np.ndindex(seconds.shape):
+            calls[j]()
+            begin = time.perf_counter()
+            calls[j]()
+            seconds[i, j] = time.perf_counter() - begin
             bar.update()
-    return seconds[1:]
+    return seconds
 
 
 def expert_episodes(distiller, task, config, workers=None, environment=None):

@@ -520,9 +520,9 @@ def test_a_pool_s_process_times_itself_alone(monkeypatch):
     assert found["plan_ms_student"] == found["plan_ms_student_in_process"] > 0
 
 
-def test_timings_take_turns_and_drop_the_first_round(monkeypatch):
-    """One that takes 9 seconds the first time and 1 later, and one that takes 2."""
-    clock, called, takes = [0.0], [], {"a": [9, 1, 1, 1], "b": [2, 2, 2, 2]}
+def test_timings_take_turns_and_count_the_second_call_of_each(monkeypatch):
+    """One that takes 9 seconds after the other's call and 1 after its own, and one that takes 2."""
+    clock, called, takes = [0.0], [], {"a": [9, 1] * 3, "b": [2] * 6}
 
     def call(name):
         called.append(name)
@@ -531,7 +531,7 @@ def test_timings_take_turns_and_drop_the_first_round(monkeypatch):
     monkeypatch.setattr(fac.time, "perf_counter", lambda: clock[0])
     calls = [lambda name=name: call(name) for name in "ab"]
     assert fac.interleaved_seconds(calls, 3, "timing").tolist() == [[1, 2]] * 3
-    assert "".join(called) == "ab" * 4
+    assert "".join(called) == "aabb" * 3
 
 
 def test_distill_shows_its_progress(distilled):

@@ -1086,8 +1086,9 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
     monkeypatch.setattr(fac, "time_both", lambda *_: {
         "plan_workers": 0, **{f"plan_ms_{who}": 1.0 for who in (
             "expert", "policy", "same_search", "student_in_process", "student")}})
-    monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: rows.extend(
-        row for run in runs for row in experiments.attempt(function, run, os.getpid())))
+    monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: (rows.extend(
+        row for run in runs for row in experiments.attempt(function, run, os.getpid())),
+        {"out": tmp_path / "none.csv"})[1])
     for samples in ("8", "4"):  # another budget: the student is there
         assert experiments.main([
             "students", "--tasks", "reacher-easy", "--seeds", "3", "--steps", "1", "--episodes",
@@ -1120,9 +1121,36 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
     experiments.report_students("students", path, tmp_path)
 
 
+def test_milliseconds_of_students_are_measured_anew_for_each_preset_and_budget(tmp_path,
+                                                                               monkeypatch):
+    write_student_rows(path := tmp_path / "students.csv")
+    write_rows(path, [("cheetah-run", 0, "default", {"num_agents": 6}, [{"step": 1, "ranks": {
+        "samples": 32, "iterations": 3, "plan_ms_expert": 7.0}}])])
+    before, timed = experiments.read_rows(path), []
+
+    def time_both(expert, student, obs):
+        timed.append([(model.config.num_agents, p.samples, p.iterations, p.prior)
+                      for model, p in (expert, student)])
+        return {"plan_ms_expert": 30.0, "plan_ms_student": float(len(timed)), "speedup": 3.0}
+
+    monkeypatch.setattr(fac, "time_both", time_both)
+    experiments.time_students(path, ["walker-run"])
+    assert timed == [[(1, 128, 4, "none"), (6, 32, 3, "policy")],
+                     [(1, 512, 6, "none"), (6, 512, 6, "none")],
+                     [(1, 128, 4, "none"), (6, 512, 6, "policy")]]
+    for old, new in zip(before, experiments.read_rows(path), strict=True):
+        number = {"paper": 2.0}.get(old["case"], 3.0 if '"samples"' in old["settings"] else 1.0)
+        found = {"plan_ms_expert": 30.0, "plan_ms_student": number}
+        assert json.loads(new["ranks"]) == {**json.loads(old["ranks"]), **(
+            found if old["task"] == "walker-run" else {})}
+        assert {**old, "ranks": ""} == {**new, "ranks": ""}
+
+
 def test_a_preset_s_students_have_its_budget_and_a_folder_of_their_own(monkeypatch):
     seen = []
-    monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: seen.extend(runs))
+    monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: (
+        seen.extend(runs), {"out": "none.csv"})[1])
+    monkeypatch.setattr(experiments, "time_students", lambda path, tasks: None)
     for flags in ([], ["--preset", "paper"], ["--preset", "paper", "--steps", "14000", "--samples",
                                               "128", "--iterations", "4"]):
         assert experiments.main(["students", "--tasks", "walker-run", "--seeds", "0", *flags]) == 0
