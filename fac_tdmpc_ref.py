@@ -21,7 +21,7 @@ the case N = 1. There is one world model, one planner, one loss. The axes, every
     O   observation features;   A = N * d   action dimensions
     B   batch;   S   action sequences (the last axis);   M   rows of a replay
     K   noise samples of the distillation loss; its actions are (L, A, B, K), a plan's (N, L, d, S)
-    H   horizon: a return G is H rewards, then Q;   L   actions of a sequence: H + 1 (Eq. 2 and 4)
+    H   horizon: a return G is H discounted rewards, then Q;   L   actions: H + 1 (Eq. 2 and 4)
     F   features an encoder reads;   P   proposals;   E   elites, or episodes;   T   decisions
 
 A decision is one planned action, which the robot repeats for two control steps; a proposal is an
@@ -60,7 +60,7 @@ def field(default, help, repr=True, **about):
 
 
 class Settings:
-    """Base of the settings below, whose values Part II checks as they are made."""
+    """Base of the settings below, whose values Part II checks as they are made; and seeds."""
 
     def __post_init__(self):
         check_settings(self)
@@ -72,13 +72,13 @@ class ModelConfig(Settings):
     dim_obs: int = field(0, "O: observation features", least=1)
     dim_action: int = field(0, "A: action dimensions", least=1, most=1_000_000)
     num_agents: int = field(1, "N: 1 is TD-MPC, A is Fac-TDMPC")
-    latent_dim: int = field(50, "m: latent features of an agent (Table 2)", least=1)
+    latent_dim: int = field(50, "m: an agent's latent features (Table 2; 5.1: 512 // N)", least=1)
     enc_dim: int = field(256, "hidden width of the encoder (Table 2)", least=1)
     mlp_dim: int = field(512, "hidden width of an agent's other networks (Table 2)", least=1)
     expert_latent_dim: int = field(0, "features of the expert's latent, if that is encoded",
                                    least=0)
     expert_enc_dim: int = field(256, "hidden width of the expert's encoder", least=1)
-    expert_mlp_dim: int = field(0, "of its frozen policy and dynamics [D9]; 0: none", least=0)
+    expert_mlp_dim: int = field(0, "width of its policy and dynamics [D9]; 0: none", least=0)
     groups: str = field("", "robot's action dimensions of each agent, 0,2/1,3; '': in order")
 
     @property
@@ -94,7 +94,7 @@ class PlannerConfig(Settings):
     iterations: int = field(4, "of MPPI [D5]; 0: its first mean acts", paper=6, least=0)
     prior: str = field("none", "first mean: the last plan's, or of the expert's policy [D9]",
                        repr=False, choices=("none", "policy"))
-    elites: int = field(0, "best ones, which refine it; 0: samples / 8 (Table 2: 64)", least=0)
+    elites: int = field(0, "best, which make the next mean; 0: samples / 8 (Table 2: 64)", least=0)
     pi_trajs: int = field(24, "P: policy proposals (Table 2)", least=0, most=10 ** 6)
     horizon: int = field(3, "H of Equation 2; or a file's", least=0, most=EPISODE_STEPS - 1)
     discount: float = field(0.99, "gamma (Table 2); or a file's", least=0, most=1)
@@ -119,7 +119,7 @@ class DistillConfig(Settings):
     steps: int = field(14_000, "gradient steps (section 5.1: 10^5) [D1]", paper=100_000, least=1)
     batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=2)
     noise_samples: int = field(5, "K: perturbations of each action [D1]", paper=10, least=2)
-    noise_std: float = field(0.3, "of the perturbations [D9]", paper=0.5, plain=0.5, above=0)
+    noise_std: float = field(0.3, "deviation of the noise [D9]", paper=0.5, plain=0.5, above=0)
     targets: str = field("credit", "a share learns its agent's part (credit), or all of them "
                          "the sum [D9]", paper="joint", plain="joint", choices=("credit", "joint"))
     policy_share: float = field(0.5, "share of states where the policy's actions are perturbed, "
@@ -148,7 +148,7 @@ class DistillConfig(Settings):
 
 
 def student_config(theirs, num_agents, encoder_input, policy=False):
-    """A student's ModelConfig, from its expert's; policy: whether it keeps the expert's [D9]."""
+    """A student's ModelConfig, from its expert's; policy: keep it, if its latent is read [D9]."""
     below = {} if encoder_input == "observation" else {
         "expert_latent_dim": theirs.num_agents * theirs.latent_dim,
         "expert_enc_dim": theirs.enc_dim, "expert_mlp_dim": theirs.mlp_dim if policy else 0}
@@ -324,7 +324,7 @@ class WorldModel:
         self.config, self.params, self.expert = config, params, None
         if config.expert_latent_dim:
             theirs = ModelConfig(config.dim_obs, config.dim_action, 1, config.expert_latent_dim,
-                                 config.expert_enc_dim, config.expert_mlp_dim or 1)
+                                 config.expert_enc_dim, config.expert_mlp_dim or 1)  # 1: unused
             self.expert = WorldModel(theirs, {k[len("_expert"):]: v for k, v in params.items()
                                               if k.startswith("_expert")})
 
@@ -341,7 +341,7 @@ class WorldModel:
         return cls(config, params)
 
     def forward(self, name, x, tape=None):
-        """Run one of its NETWORKS on x (N, in, B; the encoder's N is 1). `backward`: and back."""
+        """Run one of its NETWORKS on x (N, in, B; encoders' N is 1); `backward` walks it back."""
         return forward(NETWORKS[name], self.params, name, x, tape)
 
     def backward(self, name, tape, dy, grads):
@@ -362,7 +362,7 @@ class WorldModel:
         return self.backward("_encoder", tape, dz.reshape(1, -1, dz.shape[-1]), grads)
 
     def features(self, obs, z):
-        """What its encoder reads (1, F, B): obs (O, B), or the expert's latents z of these [D3]."""
+        """What its encoder reads (1, F, B): obs (O, B), or z, the expert's latents of obs [D3]."""
         return z.reshape(1, -1, z.shape[-1]) if self.config.expert_latent_dim else obs[None]
 
     def next(self, z, a):
@@ -539,7 +539,7 @@ def new_student(expert, config, seed):
 
 
 def learning_rate(config, t):
-    """A linear rise over `warmup` steps, times 1 or (1 + cos) / 2, which ends at 0 [D1]."""
+    """lr, rising linearly over `warmup` steps, times 1 or (1 + cos) / 2, which ends at 0 [D1]."""
     rate = config.lr * min(1.0, (t + 1) / max(1, config.warmup))
     if config.lr_schedule == "cosine":
         rate *= 0.5 * (1 + np.cos(np.pi * min(1.0, t / config.steps)))
@@ -571,7 +571,7 @@ def distill(expert, replay, config, num_agents=None, seed=0):
     optimizer, student = new_student(expert, sizes, seed)
     starts, _ = replay.starts(config.horizon + 1, config.held_out, seed)
     for t in range(config.steps):                                                       # line 3
-        rng = stream(seed, f"pool {t}")
+        rng = stream(seed, f"pool {t}")  # as Part II names its own
         rows = rng.choice(starts, config.batch_size)
         obs, actions = replay.sequences(rows, config.horizon + 1)                       # line 4
         batch = perturbed_batch(expert, student, obs, actions[..., None], config, rng)
@@ -585,7 +585,7 @@ def distill(expert, replay, config, num_agents=None, seed=0):
 def h_step_return(model, z, actions, config):
     """Equation 2 for every agent as it reads; `Returns` computes the same faster.
 
-        G = sum_{h=0}^{H-1} gamma^h f_R(s_h, a_h) + gamma^H f_Q(s_H, a_H),  s_{h+1} = f_T(s_h, a_h)
+        G_i = sum_{h=0}^{H-1} gamma^h f_R^i(s_h^i, a_h^i) + gamma^H f_Q^i(s_H^i, a_H^i)
 
     z (N, m, 1), actions (N, H + 1, d, S) -> G_i (N, S). Q is the mean of the two: unlike TD-MPC's
     minimum, a mean of sums is the sum of means, as Proposition 1 needs [D4]."""
@@ -664,7 +664,7 @@ class AgentPlanner:
         self.reset()
 
     def reset(self, seeds=()):
-        """Start an episode from a mean of zero; SeedSequences, of agents, start their streams."""
+        """Start an episode from a mean of zero; SeedSequences, one an agent, start streams."""
         sizes = self.model.config
         self.mean = np.zeros((sizes.num_agents, self.config.horizon + 1, sizes.agent_actions), F32)
         if seeds:
@@ -687,7 +687,7 @@ class AgentPlanner:
         return functools.partial(h_step_return, self.model, z, config=self.config)
 
     def proposals(self, z):
-        """Noisy policy rollouts (1, L, A, P), where there is a policy (TD-MPC's code)."""
+        """Noisy policy rollouts (1, L, A, P) of an expert (N = 1), if any (TD-MPC's code)."""
         P, L = self.config.pi_trajs, self.config.horizon + 1
         if not (self.model.has_policy and P and self.config.iterations):
             return None
