@@ -1702,7 +1702,7 @@ def task_repeat(task):
 
 def task_steps(task, config):
     """T: decisions in an episode of a task, at most, with the action repeat of a PlannerConfig."""
-    return robot_steps(make_robot(task, config.action_repeat) if is_gym(task) else None, config)
+    return gym_sizes(task, config.action_repeat)[2] if is_gym(task) else robot_steps(None, config)
 
 
 class Environment:
@@ -1786,15 +1786,16 @@ def lookup_task(task):
     """(domain, name, dim O, dim A) of a task; UserError with the nearest name otherwise."""
     task = str(task)
     if is_gym(task):
-        return *task.split(":", 1), *gym_sizes(task)
+        return *task.split(":", 1), *gym_sizes(task)[:2]
     return *task.split("-", 1), *(TASKS[task] if task in TASKS else suite_sizes(task))
 
 
 @functools.cache
-def gym_sizes(task):
-    """(dim O, dim A) of a task of Gymnasium's, from its spaces; UserError: it can't be made."""
-    robot = make_robot(task)
-    return robot.dim_obs, robot.dim_action
+def gym_sizes(task, repeat=1):
+    """(dim O, dim A, T) of a task of Gymnasium's, from its robot; UserError: it can't be made."""
+    robot = make_robot(task, repeat)
+    robot.env.close()  # the one that plays may need what it holds
+    return robot.dim_obs, robot.dim_action, robot.episode_steps
 
 
 @functools.cache
@@ -2221,12 +2222,12 @@ def train_student(distiller, out, settings, planning, workers):
 def same_settings(found, expected, where, group=""):
     """UserError if a file is of a run with other settings (dicts, whose values may be dicts)."""
     for key in {**found, **expected}:
-        values = found.get(key), expected.get(key)
-        if all(isinstance(value, dict) for value in values):
-            same_settings(*values, where, f"{key}: ")
+        theirs, ours = found.get(key), expected.get(key)
+        if isinstance(theirs, dict) and isinstance(ours, dict):
+            same_settings(theirs, ours, where, f"{key}: ")
         else:
-            need(values[0] == values[1], f"{where}: a run with other settings ({group}{key}: "
-                 f"expected {values[1]}, found {values[0]}); choose another --out, or empty it")
+            need(theirs == ours, f"{where}: a run with other settings ({group}{key}: expected "
+                 f"{ours}, found {theirs}); choose another folder (--out), or empty it")
 
 
 def write_curve(path, columns, rows):
@@ -2305,12 +2306,10 @@ def read_records(path):
     path = Path(path).with_suffix(".json")
     try:
         records = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-        found = {key: about if isinstance(about, dict) else {"returns": about, "versions": {}}
-                 for key, about in records.items()}  # those without versions are older
         return {key: ([float(r) for r in about["returns"]], dict(about["versions"]))
-                for key, about in found.items()}
+                for key, about in records.items()}
     except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
-        raise UserError(f"{path}: not what evaluate --record writes ({error}); delete it") from None
+        raise UserError(f"{path}: not what evaluate --record writes ({error}); rename it") from None
 
 
 def record_key(model, config, seed):
@@ -2385,7 +2384,7 @@ def load_data(args):
     need(header.get("task") == args.task, f"{path}: header: task: expected {args.task!r}, found "
          f"{header.get('task')!r}")
     check_task(expert.config, args.task)
-    make_robot(args.task)  # what is missing is missed now, not after the last step
+    is_gym(args.task) or make_robot(args.task)  # what is missing is missed now, not at the end
     replay = load_replay(args.replay or path.with_name("replay.npz"),
                          made_for(header, path).get("action_repeat", ACTION_REPEAT))
     return expert, header, replay, path
@@ -2449,7 +2448,8 @@ def evaluate_both(expert, student, path, args):
     found = {"episodes": args.episodes, "eval_seed": args.eval_seed}
     for name, (model, planning) in compared(expert, student).items():
         returns, versions = recorded_returns(path, model, planning, args.eval_seed)
-        recorded = len(returns) >= args.episodes and not args.evaluate_expert
+        recorded = len(returns) >= args.episodes and not (
+            args.evaluate_expert or args.task.count(":") > 1)  # gym:MODULE:ID may have changed
         if not recorded:
             versions, returns = software(), evaluate(
                 model, args.task, planning, args.episodes, args.eval_seed, args.workers,

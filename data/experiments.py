@@ -96,7 +96,7 @@ def read_rows(path):
 def append_rows(path, rows):
     """Add a run's rows to a CSV in one write."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, ROW)
+    writer = csv.DictWriter(text, ROW, lineterminator="\n")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(path, "a+b") as file:
@@ -272,8 +272,10 @@ def distil(task, seed, case, settings):
     expert, header = fac.load_model(fac.data_file(task, "expert.npz"))
     distiller = distiller_of(case)(expert, fac.Replay(fac.data_file(task, "replay.npz")), config,
                                    own["num_agents"], seed)
-    planning = planning_for(header, {**fac.student_planning(config), **about,
-                                     "horizon": config.horizon})
+    search = fac.STUDENT_PLANNING if case == "D8" else fac.student_planning(config)
+    if case == "D9" or config.encoder_input == "observation":  # the latter keeps no policy
+        search = {}
+    planning = planning_for(header, {**search, **about, "horizon": config.horizon})
     student, environment = distiller.student, None
     if case == "TAP":  # whose actions are others, which the expert's policy doesn't know
         environment = DecodingEnvironment(task, expert, distiller.vae, planning.action_repeat)
@@ -375,7 +377,8 @@ def command_students(args):
     result = run_all(args, functools.partial(students.distil_student, students=args.students),
                      distil_runs(args, lambda task: [
                          (args.preset, {"num_agents": fac.lookup_task(task)[3]})]))
-    time_students(Path(result["out"]), args.tasks)
+    if result["now"]:
+        time_students(Path(result["out"]), args.tasks)
     return result
 
 
@@ -399,7 +402,7 @@ def time_students(path, tasks):
                 row["ranks"] = json.dumps({**found, **{
                     key: ms[key] for key in ms if key.startswith(students.MEASURED)}})
         with fac.atomic_file(path, "w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, ROW)
+            writer = csv.DictWriter(file, ROW, lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
 
@@ -578,6 +581,7 @@ def follow(task, seed, case, settings):
 
 def command_figure12(args):
     """figure12: online distillation (C.1)."""
+    fac.need(not any(map(fac.is_gym, args.tasks)), "--tasks: expected dm_control's")
     fac.need(not args.decisions or args.decisions % 2000 == 0,
              f"--decisions: a multiple of 2000, not {args.decisions}")
     about = {task: {"decisions": args.decisions or DECISIONS.get(task, 30_000),
@@ -692,7 +696,7 @@ def report_curves(name, path, figures):
     if name == "figure4":
         heads.append("authors: " + " / ".join(FIGURE4))
         for row in table:
-            row.append(" / ".join(map(str, AUTHORS[row[0]])))
+            row.append(" / ".join(map(str, AUTHORS.get(row[0], "-"))))
     for task, level in levels.items():
         result[task].update({"expert_recorded": level} if level is not None else {})
     if name == "figure12":
@@ -889,7 +893,8 @@ def make_parser():
         sub.add_argument("--students", default="runs", help="where distill left TASK-SEED/ [runs]")
     sub = add_runs("students", command_students, "Students as distill makes them by default, for "
                    "the README's main table: evaluation seeds 0 and 1, and the expert's policy "
-                   "alone.", shipped, episodes=20)
+                   "alone; then, where any is new, milliseconds of all these tasks' (keep the "
+                   "machine quiet for these).", shipped, episodes=20)
     sub.add_argument("--students", default="runs", help="leave them in TASK-SEED/ there [runs]")
     sub.add_argument("--preset", choices=("default", "plain", "paper"), default="default",
                      help="distill's: a column of the table for each [default]")

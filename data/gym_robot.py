@@ -4,8 +4,9 @@
         --std-steps 4000 --latent-dim 16 --enc-dim 64 --mlp-dim 128
     python fac_tdmpc_ref.py distill --task gym:Pendulum-v1 --expert runs/train-gym:Pendulum-v1-0
 
-gym:MODULE:ID imports MODULE first, which registers a robot of your own. fac_tdmpc_ref.make_robot
-makes one of these, wherever a task is played; it needs `pip install 'fac-tdmpc-ref[gym]'`.
+gym:MODULE:ID imports MODULE, from your PYTHONPATH, which registers a robot of your own.
+fac_tdmpc_ref.make_robot makes one of these, wherever a task is played; it needs `pip install
+'fac-tdmpc-ref[gym]'`.
 """
 import warnings
 

@@ -9,8 +9,9 @@ What wrappers put before the names (`_orig_mod.`, `module.`, `agent.model.`) is 
 lies beside the weights (steps, settings, optimizers) left alone. DIR gets expert.npz and, with
 --replay (arrays that you have, by this project's names or D4RL's, in an .npz or HDF5) or --collect
 (episodes that the expert plays now), replay.npz. The expert must read dm_control's observation dict
-in its own order. All that plays it follows the --action-repeat that the files then name: 2 in
-TD-MPC's code, 4 for reacher, hopper, fish, cheetah and quadruped.
+in its own order. All that plays it follows the --action-repeat that the files then name: 2 here, in
+TD-MPC's code for walker, humanoid, finger and dog, 8 for cartpole, 4 for all others. (Its reacher
+has two links, this project's three.)
 
 A file is data, whoever made it. A `.pt` is a zip around a pickle, and a pickle is a program:
 `read_pickle` knows the opcodes and names that a state dict is made of and refuses all others, so

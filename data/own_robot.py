@@ -55,7 +55,7 @@ def main(episodes=24, updates=400, steps=3000, out=Path("runs/own-robot")):
     for kind, model, plan in (("expert", expert, planning), ("student", distiller.student, around)):
         fac.save_model(out / f"{kind}.npz", model, {"kind": kind, "planner": vars(plan)})
         returns = fac.play(model, None, plan, range(90, 96), environment=robot)[2].sum(1)
-        print(f"{kind}: {returns.mean():.0f} of {fac.EPISODE_STEPS}")
+        print(f"{kind}: {returns.mean():.0f}")
 
 
 if __name__ == "__main__":

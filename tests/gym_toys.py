@@ -37,6 +37,21 @@ class Told(Walk):
             setattr(self, f"{name}_space", space)
 
 
+class Port(Walk):
+    """One at a time holds what it needs."""
+
+    taken = False
+
+    def __init__(self):
+        super().__init__()
+        if Port.taken:
+            raise OSError("port is in use")
+        Port.taken = True
+
+    def close(self):
+        Port.taken = False
+
+
 class Older(Walk):
     """Of an older Gym's signatures, or without a reward, as an option says."""
 
@@ -65,6 +80,7 @@ if "Walk-v0" not in gymnasium.registry:
     gymnasium.register("Walk-v0", Walk, max_episode_steps=12)
     gymnasium.register("Stroll-v0", Walk, max_episode_steps=12, kwargs={"falls": False})
     gymnasium.register("Endless-v0", Walk, kwargs={"falls": False})
+    gymnasium.register("Port-v0", Port, max_episode_steps=12)
     for odd in ("seed", "reset", "step", "reward"):
         gymnasium.register(f"Older-{odd}-v0", Older, max_episode_steps=12, kwargs={"odd": odd})
     for name, spaces in SPACES.items():

@@ -314,7 +314,7 @@ def refused(done, *parts, program="fac_tdmpc_ref.py"):
     (["--replay", "{files}/walker.npz"], ["walker.npz", "(24, 6)", "(8, 3)"]),
     (["--replay", "{files}/expert.npz"], ["expert.npz", "kind", "'expert'"]),
     (["--expert", "{files}/replay.npz"], ["replay.npz", "kind", "'replay'"]),
-    (["--expert", "{files}/spoilt.npz"], ["spoilt.json", "delete it"]),  # before it distils
+    (["--expert", "{files}/spoilt.npz"], ["spoilt.json", "rename it"]),  # before it distils
     (["--out", "{files}/corrupt.npz"], ["corrupt.npz", "can't be read or written"]),
     (["--out", "{files}/corrupt.npz/below"], ["corrupt.npz", "can't be read or written"]),
 ])
@@ -1032,11 +1032,9 @@ def test_recorded_returns_stand_for_the_expert_in_distill(tmp_path, files, no_pl
         json.loads(done.stdout.splitlines()[-1])
 
     record = expert.with_suffix(".json")
-    for older in ({"numpy": "1.0"}, None):  # None: as records without versions are
-        record.write_text(json.dumps({key: {"returns": returns, "versions": older} if older else
-                                      returns}))
-        done = succeeded(run(*arguments, "--workers", "0", cwd=tmp_path, env=no_plots))
-        assert "expert (recorded with other versions)" in done.stdout
+    record.write_text(json.dumps({key: {"returns": returns, "versions": {"numpy": "1.0"}}}))
+    done = succeeded(run(*arguments, "--workers", "0", cwd=tmp_path, env=no_plots))
+    assert "expert (recorded with other versions)" in done.stdout
 
     labels = []
 
@@ -1100,14 +1098,16 @@ def test_a_record_counts_for_its_own_weights_planner_and_episodes_only(tmp_path)
 
 def test_a_record_of_other_versions_gives_way_to_a_shorter_one_of_these(tmp_path):
     path, about = tmp_path / "expert.npz", (random_model(), fac.PlannerConfig(), 5)
-    path.with_suffix(".json").write_text(json.dumps({fac.record_key(*about): [1.0, 2.0]}))
+    path.with_suffix(".json").write_text(json.dumps({fac.record_key(*about): {
+        "returns": [1.0, 2.0], "versions": {}}}))
     assert list(fac.read_records(path).values()) == [([1.0, 2.0], {})]
     fac.record_returns(path, *about, [3.0])
     assert list(fac.read_records(path).values()) == [([3.0], fac.software())]
 
 
 @pytest.mark.parametrize("text", ["{", "[3]", '"x"', '{"a": 1}', '{"a": ["x"]}', '{"a": {}}',
-                                  '{"a": {"returns": [1], "versions": 2}}'])
+                                  '{"a": {"returns": [1], "versions": 2}}',
+                                  '{"layers": [256, 256]}'])  # a user's settings
 def test_a_spoilt_record_is_named(tmp_path, text):
     (tmp_path / "expert.json").write_text(text)
     with pytest.raises(fac.UserError, match="expert.json: not what evaluate --record writes"):

@@ -42,7 +42,8 @@ def run(*arguments, cwd, env=ONE_THREAD):
     (["table3", "--runs", "9"], ["runs", "at least 10"]),
     (["table3", "--workers", "-1"], ["--workers", "-1"]),
     (["table3", "--elites", "600"], ["samples (512)", "not 600"]),
-    (["figure12", "--decisions", "1000"], ["--decisions", "multiple of 2000", "not 1000"])])
+    (["figure12", "--decisions", "1000"], ["--decisions", "multiple of 2000", "not 1000"]),
+    (["figure12", "--tasks", "gym:Pendulum-v1"], ["--tasks", "dm_control's"])])
 def test_bad_commands_are_refused(tmp_path, flags, parts):
     refused(run(*flags, cwd=tmp_path), *parts)
 
@@ -403,6 +404,20 @@ def test_a_run_is_distilled_as_it_says(monkeypatch):
     assert made == [(3, 5)] and last == [3, 2, 7] and evaluated == fac.episode_seeds(0, 10)
     assert played == fac.training_seeds(5, "expert episode", 0, 3)
     assert (row["rank_q"], row["rank_return"]) == (0, 6)
+
+
+@pytest.mark.parametrize("case, settings, prior", [
+    ("default", {}, "policy"), ("D3", {"encoder_input": "observation"}, "none"),
+    ("D8", {"policy_share": 0.0}, "policy"), ("D9", {"targets": "joint"}, "none")])
+def test_a_departure_s_student_searches_around_the_policy_but_for_d3_and_d9(monkeypatch, case,
+                                                                           settings, prior):
+    planned = []
+    monkeypatch.setattr(experiments, "measure", lambda model, task, planning, *_: (
+        planned.append(planning.prior), fac.Planner(model, planning).close(), {})[2])
+    monkeypatch.setattr(fac.Distiller, "ranks", lambda *_: (np.arange(3), np.arange(3)))
+    list(experiments.distil("cheetah-run", 0, case, {
+        **settings, "steps": 1, "batch_size": 2, "expert_episodes": 0}))
+    assert planned == [prior]
 
 
 def test_every_method_of_figure_4_learns_from_its_run_s_seed(replay, monkeypatch):
@@ -791,6 +806,9 @@ def test_a_report_needs_no_expert(tmp_path, monkeypatch):
     monkeypatch.setattr(experiments, "draw_lines", lambda *_, **__: None)
     result, table = experiments.report_curves("figure4", tmp_path / "figure4.csv", tmp_path)
     assert result["walker-run"]["TAP"]["mean"] == 7 and "| walker-run | 7 | - |" in table
+    write_rows(path := tmp_path / "other.csv", [("walker-stand", 0, "TAP", {"data": [1]}, rows)])
+    _, table = experiments.report_curves("figure4", path, tmp_path)  # not one of the paper's
+    assert "| walker-stand | 7 | - | - |" in table
 
 
 def test_what_a_student_was_made_with_tells_it_apart():
@@ -1088,7 +1106,7 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
             "expert", "policy", "same_search", "student_in_process", "student")}})
     monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: (rows.extend(
         row for run in runs for row in experiments.attempt(function, run, os.getpid())),
-        {"out": tmp_path / "none.csv"})[1])
+        {"out": tmp_path / "none.csv", "now": 1})[1])
     for samples in ("8", "4"):  # another budget: the student is there
         assert experiments.main([
             "students", "--tasks", "reacher-easy", "--seeds", "3", "--steps", "1", "--episodes",
@@ -1149,8 +1167,8 @@ def test_milliseconds_of_students_are_measured_anew_for_each_preset_and_budget(t
 def test_a_preset_s_students_have_its_budget_and_a_folder_of_their_own(monkeypatch):
     seen = []
     monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: (
-        seen.extend(runs), {"out": "none.csv"})[1])
-    monkeypatch.setattr(experiments, "time_students", lambda path, tasks: None)
+        seen.extend(runs), {"out": "none.csv", "now": 0})[1])
+    monkeypatch.setattr(experiments, "time_students", None)  # where nothing is new
     for flags in ([], ["--preset", "paper"], ["--preset", "paper", "--steps", "14000", "--samples",
                                               "128", "--iterations", "4"]):
         assert experiments.main(["students", "--tasks", "walker-run", "--seeds", "0", *flags]) == 0

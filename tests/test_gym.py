@@ -9,6 +9,7 @@ import pytest
 import experiments
 import fac_tdmpc_ref as fac
 import import_expert
+import multitask
 import train_expert
 from test_cli import BLOCKED, ONE_THREAD, ROOT, SCRIPT, launch, refused, succeeded
 from test_equation1 import small_batch, small_learner
@@ -72,6 +73,26 @@ def test_episodes_are_as_long_as_the_robot_says_in_processes_too():
     found = fac.evaluate(model, WALK, config, 4, 0, 0)
     assert found["returns"] == [fallen(seed) for seed in fac.episode_seeds(0, 4)]
     assert np.isfinite(found["plan_ms_median"])
+
+
+def test_a_robot_that_only_one_process_can_hold_is_played():
+    model = fac.WorldModel.create(fac.ModelConfig(3, 2, 2, 2, 4, 4), np.random.default_rng(0))
+    config = fac.PlannerConfig(samples=2, iterations=1, action_repeat=1)
+    found = fac.evaluate(model, "gym:gym_toys:Port-v0", config, 2, 0, 0)
+    assert found["returns"] == [fallen(seed) for seed in fac.episode_seeds(0, 2)]
+
+
+def test_no_record_speaks_for_a_robot_that_may_be_another_by_now(tmp_path, monkeypatch):
+    model = fac.WorldModel.create(fac.ModelConfig(3, 2, 1, 2, 4, 4), np.random.default_rng(0))
+    config = fac.PlannerConfig(samples=2, iterations=1, action_repeat=1)
+    fac.record_returns(path := tmp_path / "x.npz", model, config, 0, [99.0, 99.0])
+    measured = [fallen(seed) for seed in fac.episode_seeds(0, 2)]
+    args = fac.make_parser().parse_args(["distill", "--task", WALK, "--episodes", "2",
+                                         "--workers", "0"])
+    found = fac.evaluate_both((model, config), (model, config), path, args)
+    assert (found["expert_returns"], found["expert_recorded"]) == (measured, False)
+    assert multitask.recorded(model, {"task": WALK, "planner": {"samples": 2}}, path, 2, 0) == (
+        measured)
 
 
 def test_a_gym_task_s_action_is_applied_once_unless_told_otherwise():
