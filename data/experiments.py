@@ -320,7 +320,8 @@ def distil_runs(args, cases):
 
 
 def data_checksums(task):
-    """Of a task's expert and replay, as a student's file names them; of the defaults."""
+    """Of a task's expert and replay, as a student's file names them; of the defaults, but for
+    STUDENT_PLANNING."""
     expert, _ = fac.load_model(fac.data_file(task, "expert.npz"))
     return [*fac.data_checksums(expert, fac.Replay(fac.data_file(task, "replay.npz"))),
             crc(fac.DistillConfig(), fac.PlannerConfig())]
@@ -377,13 +378,13 @@ def command_students(args):
     result = run_all(args, functools.partial(students.distil_student, students=args.students),
                      distil_runs(args, lambda task: [
                          (args.preset, {"num_agents": fac.lookup_task(task)[3]})]))
-    if result["now"]:
-        time_students(Path(result["out"]), args.tasks)
+    time_students(Path(result["out"]), args.tasks)
     return result
 
 
 def time_students(path, tasks):
-    """Measure a CSV's milliseconds of tasks' decisions anew: beside other runs they were longer."""
+    """Measure milliseconds of tasks' decisions anew where some of a CSV's rows have only those of
+    `distill`, which were longer beside other runs."""
     with lock(path):
         groups = defaultdict(list)  # of seeds, which take as long
         for row in (rows := read_rows(path)):
@@ -391,6 +392,8 @@ def time_students(path, tasks):
                 found = json.loads(row["ranks"])
                 groups[row["task"], row["case"], row["settings"], found["samples"],
                        found["iterations"]].append((row, found))
+        if all(row["ms"] for own in groups.values() for row, _ in own):
+            return
         for (task, preset, _, samples, iterations), own in groups.items():
             expert, header = fac.load_model(fac.data_file(task, "expert.npz"))
             student, about = fresh_student(own[0][0], preset)
@@ -401,6 +404,8 @@ def time_students(path, tasks):
             for row, found in own:
                 row["ranks"] = json.dumps({**found, **{
                     key: ms[key] for key in ms if key.startswith(students.MEASURED)}})
+                row["ms"] = f"{ms['plan_ms_student_in_process']:.6g}"
+                row["ms_workers"] = f"{ms['plan_ms_student']:.6g}"
         with fac.atomic_file(path, "w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, ROW, lineterminator="\n")
             writer.writeheader()
@@ -623,8 +628,9 @@ def one_figure(path, keys, varied):
     return {task: found for (task, *rest), (found, *_) in seen.items() if not rest}
 
 
-def settled(path, varied=()):
-    """A CSV's finished runs, of one figure; without seeds that lack some of what is varied."""
+def settled(path, varied=(), whole=True):
+    """A CSV's finished runs, of one figure; `whole`: without seeds that lack some of what is
+    varied."""
     rows = finished(read_rows(path))
     old = {row["versions"] for own in rows.values() for row in own if row["return_mean"]}
     if old - {versions()}:
@@ -635,8 +641,8 @@ def settled(path, varied=()):
             if budget["data"] != made_from(task, budget):
                 print(f"{path}: {task} is of other data or defaults than now", file=sys.stderr)
     have = Counter(key[:3] for key in rows)
-    parts = [(task, seed, case) for (task, seed, case), count in have.items() if count < max(
-        other for (t, _, c), other in have.items() if (t, c) == (task, case))]
+    parts = [(task, seed, case) for (task, seed, case), count in have.items() if whole and count <
+             max(other for (t, _, c), other in have.items() if (t, c) == (task, case))]
     for task, seed, case in parts:
         print(f"{path}: {case} of {task}, seed {seed}, isn't whole: left out", file=sys.stderr)
     return {key: own for key, own in rows.items() if key[:3] not in parts}
@@ -655,8 +661,8 @@ def curves(rows, column="return_mean"):
 
 
 def expert_level(task, rows):
-    """The mean of an expert's recorded returns, planned as the runs were; None: no record, or the
-    runs are of another expert."""
+    """The mean of an expert's recorded returns, of its own search but for the runs' samples and
+    iterations; None: no record, or the runs are of another expert."""
     about = next((json.loads(settings) for own, _, _, settings in rows if own == task), {})
     if not (path := fac.DATA / task / "expert.npz").exists():
         return None
@@ -733,7 +739,7 @@ def report_figure7(_, path, figures):
         for row in own:
             if row["return_mean"]:
                 found = (*halves(row), float(row["return_mean"]))
-                split.add(bool(row["returns"]))
+                split.add(len(json.loads(row["returns"] or "[]")) > 1)
                 for key, value in zip(("chosen_by", "return", "all"), found):
                     into[key].append(value)
             for key in ("ms", "ms_workers"):
@@ -793,7 +799,7 @@ def report_figure8(_, path, figures):
 def report_students(_, path, figures):
     """Students as `distill` makes them: the README's main table, all of it, the same search."""
     lines = students.by_line(
-        row for own in settled(path, VARIED["students"]).values() for row in own)
+        row for own in settled(path, VARIED["students"], False).values() for row in own)
     result, text = students.table(lines, {
         task: f"{found[1]} / {found[0]}" for task, found in AUTHORS.items()})
     return result, "\n".join([students.readme_table(lines, result), text,

@@ -81,7 +81,8 @@ def draw_frames(episodes):
 def command_watch(args):
     """watch: an episode as a moving picture."""
     kind = Path(args.out).suffix
-    fac.need(kind in (".gif", ".mp4"), f"{args.out}: expected a name that ends in .gif or .mp4")
+    fac.need(kind in (".gif", ".mp4") and not Path(args.out).is_dir(),
+             f"{args.out}: expected the name of a .gif or .mp4 file")
     fac.check_writable(args.out)
     fac.pyplot()  # brings Pillow
     if kind == ".mp4":

@@ -175,6 +175,7 @@ def command_table3(args):
     """table3: the networks and whole decisions on this machine."""
     planning = fac.from_args(fac.PlannerConfig, args,
                              **fac.preset_values(fac.PlannerConfig, "paper"))
+    fac.need(planning.iterations, "--iterations: expected at least 1, found 0")
     args.robots = list(dict.fromkeys(args.robots))
     if args.command == "figure6":
         args.figure = args.figure or fac.DATA / "figures" / "figure6.png"

@@ -1,5 +1,6 @@
 """Students as `distill` makes them, and their tables: `experiments.py students`."""
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -27,10 +28,15 @@ def distil_student(task, seed, preset, settings, students):
     """Distil a student by `distill`, which leaves it in `students`, once; a row for each evaluation
     seed. settings: of FLAGS, `steps` and `episodes`."""
     flags = [f"--{FLAGS.get(name, name)}={value}" for name, value in settings.items()]
+    out = default = folder(students, task, seed, preset)
+    if budget := [f"{k}-{settings[k]}" for k in ("samples", "iterations") if k in settings]:
+        out = default.with_name("-".join([default.name, *budget]))  # its file names its search
+        if default.exists() and not out.exists():
+            shutil.copytree(default, out)
     for evaluation_seed in reversed(EVALUATION_SEEDS):  # the first's result.json stays
         args = fac.make_parser().parse_args([
             "distill", "--task", task, "--seed", str(seed), "--preset", preset, "--workers", "0",
-            "--out", str(folder(students, task, seed, preset)), *flags,
+            "--out", str(out), *flags,
             "--eval-seed", str(evaluation_seed)])
         found = args.run(args)
         yield {"step": found["steps"], **of_returns(found["student_returns"], evaluation_seed),
@@ -84,10 +90,12 @@ def cells(rows):
         return ["-"] * len(HEADS)
     first, students = rows[0], sum(rows.values(), [])
     same = [row for row in students if returns(row, "same_search_returns")]
-    faster = (measured(of, lambda x, key=key: x[key] / x["plan_ms_student_in_process"])
+    faster = (measured(of, lambda x, key=key: x[key]) /
+              measured(of, lambda x: x["plan_ms_student_in_process"])
               for key, of in (("plan_ms_expert", first), ("plan_ms_same_search", same)) if of)
     ranks = (measured(first, lambda x, h=h: x["rank_correlation_returns"][h]) for h in (0, -1))
-    budget = "{samples} x {iterations}".format_map(json.loads(first[0]["ranks"]))
+    budget = " / ".join(dict.fromkeys(
+        "{samples} x {iterations}".format_map(json.loads(row["ranks"])) for row in first))
     means = [float(row["return_mean"]) for row in first]
     return [len(first), budget, mean_and_spread(means, deviation),
             " / ".join(f"{kept(rows[seed]):.2f}" for seed in EVALUATION_SEEDS),

@@ -71,8 +71,9 @@ def draw_lines(path, panels, xlabel, **axes):
             ax.fill_between(x, mean - std, mean + std, color=style["color"], alpha=0.15)
         if level is not None:
             ax.axhline(level, color="black", linewidth=0.8, linestyle=(0, (1, 3)), label="expert")
+        low = min([0, *(np.mean(y) for points in lines.values() for y in points.values())])
         ax.set(title=title, xlabel=xlabel, ylabel="episode return",
-               ylim=(0, 1.05 * ax.get_ylim()[1]), **axes)
+               ylim=(1.05 * low, 1.05 * max(0, ax.get_ylim()[1])), **axes)
         if axes:  # logarithmic: a tick for each point
             ax.set_xticks(x := sorted(set().union(*lines.values())), [f"{v:.0f}" for v in x])
             ax.minorticks_off()

@@ -25,6 +25,7 @@ import numpy as np
 sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
 import fac_tdmpc_ref as fac  # noqa: E402
 from numpy_learner import ExpertConfig, Learner, named, unnamed  # noqa: E402
+from tables import draw_lines  # noqa: E402
 
 # for a few cores; hidden layers of 512, as in Table 2, make an update three times as dear
 TRAINING_DEFAULTS = {"mlp_dim": 256, "batch_size": 128}  # [D6]
@@ -671,27 +672,16 @@ def export(training, out, result):
         result["lag"] = {str(p): lag(training.curve, p / 100) for p in (50, 75, 90)}
         if args.episodes:
             result["ratio"] = fac.return_kept(result["student_return_mean"], result["return_mean"])
-    fac.drawn(draw, out / "curve.png", training.curve, f"{args.task}, seed {args.seed}")
+    lines = {label: {row["decisions"]: [row[key]] for row in training.curve if row[key] is not None}
+             for key, label in (("return_mean", "training episodes"), ("eval_expert", "expert"),
+                                ("eval_student", "student")) if training.curve[-1][key] is not None}
+    fac.drawn(draw_lines, out / "curve.png", {f"{args.task}, seed {args.seed}": (lines, None)},
+              "decisions")
     print(f"\n{args.task}: {training.decisions:,} decisions, {result['updates']:,} updates, "
           f"{training.seconds / 60:.1f} minutes; {args.episodes} evaluation episodes\n")
     fac.print_table(rows)
     print(f"\n{out}/")
     return result
-
-
-def draw(path, curve, title):
-    """Returns over the decisions."""
-    plt = fac.pyplot()
-    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
-    for key, label, style in (("return_mean", "training episodes", {"alpha": 0.5}),
-                              ("eval_expert", "expert", {"marker": "o"}),
-                              ("eval_student", "student", {"marker": "o"})):
-        points = [(row["decisions"], row[key]) for row in curve if row[key] is not None]
-        if points:
-            axes.plot(*zip(*points), label=label, **style)
-    axes.set(xlabel="decisions", ylabel="return", title=title)
-    axes.legend()
-    fac.save_figure(path, figure)
 
 
 def make_parser():

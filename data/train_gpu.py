@@ -332,7 +332,12 @@ def train(args):
     models = [before[i][0] if i < len(before) else fac.WorldModel.create(
         size, fac.stream(args.seed, "expert", i), policy=True) for i, size in enumerate(sizes)]
     episodes = max(1, config.buffer_size // fac.EPISODE_STEPS // args.envs) * args.envs
-    learner = Learner(models, config, planning, episodes, device, getattr(torch, args.precision))
+    try:
+        learner = Learner(models, config, planning, episodes, device,
+                          getattr(torch, args.precision))
+    except RuntimeError as error:  # PyTorch's, of memory
+        raise fac.UserError(f"--buffer-size {config.buffer_size}: {str(error).splitlines()[0]}"
+                            ) from None
     with fac.locked(args.out), torch.no_grad(), \
             fac.Workers(playing_worker, args.envs, "playing worker") as workers:
         workers.send_all([(args.tasks, learner.dim_obs)] * args.envs)

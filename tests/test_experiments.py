@@ -827,6 +827,17 @@ def test_a_seed_that_lacks_runs_is_left_out(tmp_path, capsys):
     found = experiments.settled(path, experiments.VARIED["figure7"])
     assert [key[1] for key in found] == ["0", "0"]
     assert "student of walker-run, seed 1, isn't whole: left out" in capsys.readouterr().err
+    assert len(experiments.settled(path, experiments.VARIED["figure7"], whole=False)) == 3
+
+
+def test_negative_returns_are_drawn(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(fac, "save_figure", lambda path, figure: drawn.extend(figure.axes))
+    for values in ([-1200.0, -250.0], [0.0, 900.0]):
+        points = {step: [value] for step, value in enumerate(values)}
+        tables.draw_lines(tmp_path / "x.png", {"a robot": ({"TAP": points}, None)}, "step")
+    (low, high), (least, most) = (ax.get_ylim() for ax in drawn)
+    assert low < -1200 and high == 0 and least == 0 and most > 900
 
 
 @pytest.mark.parametrize("left", ["", "task,se"])
@@ -1085,6 +1096,15 @@ def test_the_table_of_students_has_a_line_for_each_preset_and_each_chosen_budget
     assert "| 125 ± 75 | - | 2 | 32 x 3 | 88 ± 18 |" in text
 
 
+def test_another_budget_of_one_seed_leaves_the_default_s_line_whole(tmp_path):
+    write_student_rows(path := tmp_path / "students.csv")
+    head, *lines = path.read_text().splitlines()
+    path.write_text("\n".join([head, *(line for line in lines if not (
+        line.startswith("walker-run,1") and "samples\"\": 512" in line.split("}")[0]))]))
+    result, _ = experiments.report_students("students", path, tmp_path)
+    assert result["walker-run"]["seeds"] == 2
+
+
 def test_the_readmes_hold_the_tables_that_the_rows_give():
     results = ROOT / "data" / "results"
     _, text = experiments.report_students("students", results / "students.csv", None)
@@ -1106,17 +1126,20 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
             "expert", "policy", "same_search", "student_in_process", "student")}})
     monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: (rows.extend(
         row for run in runs for row in experiments.attempt(function, run, os.getpid())),
-        {"out": tmp_path / "none.csv", "now": 1})[1])
-    for samples in ("8", "4"):  # another budget: the student is there
+        {"out": tmp_path / "none.csv"})[1])
+    for budget in ([], ["--iterations", "1", "--samples", "4"]):  # a copy of the student is there
         assert experiments.main([
             "students", "--tasks", "reacher-easy", "--seeds", "3", "--steps", "1", "--episodes",
-            "1", "--iterations", "1", "--samples", samples, "--students", str(tmp_path)]) == 0
+            "1", *budget, "--students", str(tmp_path)]) == 0
     experiments.append_rows(path := tmp_path / "students.csv", rows)
     rows = experiments.read_rows(path)
     assert [row["evaluation_seed"] for row in rows] == ["1", "0"] * 2 and len(steps) == 1
-    assert [json.loads(row["settings"])["samples"] for row in rows] == [8, 8, 4, 4]
+    assert [json.loads(row["settings"]).get("samples") for row in rows] == [None, None, 4, 4]
     assert len(experiments.finished(rows)) == 2
-    model, header = fac.load_model(tmp_path / "reacher-easy-3" / "student.npz")
+    _, header = fac.load_model(tmp_path / "reacher-easy-3" / "student.npz")
+    assert header["planner"]["samples"] == 32
+    model, header = fac.load_model(tmp_path / "reacher-easy-3-samples-4-iterations-1" /
+                                   "student.npz")
     assert (header["seed"], model.config.num_agents, header["distill"]["steps"]) == (3, 3, 1)
     expert, _ = fac.load_model(fac.data_file("reacher-easy", "expert.npz"))
     own, students_own = (fac.PlannerConfig(**of) for of in ({}, fac.made_for(header, "")))
@@ -1135,7 +1158,7 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
         assert row["versions"] == experiments.versions()
         assert f"numpy {np.__version__}" in row["versions"] and "mujoco 3" in row["versions"]
     result = json.loads((tmp_path / "reacher-easy-3" / "result.json").read_text())
-    assert result["eval_seed"] == 0
+    assert (result["eval_seed"], result["samples"]) == (0, 32)
     experiments.report_students("students", path, tmp_path)
 
 
@@ -1149,7 +1172,8 @@ def test_milliseconds_of_students_are_measured_anew_for_each_preset_and_budget(t
     def time_both(expert, student, obs):
         timed.append([(model.config.num_agents, p.samples, p.iterations, p.prior)
                       for model, p in (expert, student)])
-        return {"plan_ms_expert": 30.0, "plan_ms_student": float(len(timed)), "speedup": 3.0}
+        return {"plan_ms_expert": 30.0, "plan_ms_student": float(len(timed)), "speedup": 3.0,
+                "plan_ms_student_in_process": 7.0}
 
     monkeypatch.setattr(fac, "time_both", time_both)
     experiments.time_students(path, ["walker-run"])
@@ -1158,17 +1182,22 @@ def test_milliseconds_of_students_are_measured_anew_for_each_preset_and_budget(t
                      [(1, 128, 4, "none"), (6, 512, 6, "policy")]]
     for old, new in zip(before, experiments.read_rows(path), strict=True):
         number = {"paper": 2.0}.get(old["case"], 3.0 if '"samples"' in old["settings"] else 1.0)
-        found = {"plan_ms_expert": 30.0, "plan_ms_student": number}
-        assert json.loads(new["ranks"]) == {**json.loads(old["ranks"]), **(
-            found if old["task"] == "walker-run" else {})}
-        assert {**old, "ranks": ""} == {**new, "ranks": ""}
+        found = {"plan_ms_expert": 30.0, "plan_ms_student": number,
+                 "plan_ms_student_in_process": 7.0} if old["task"] == "walker-run" else {}
+        assert json.loads(new["ranks"]) == {**json.loads(old["ranks"]), **found}
+        assert {**old, "ranks": "", "ms": "7" * bool(found),
+                "ms_workers": f"{number:.0f}" * bool(found)} == {**new, "ranks": ""}
+    experiments.time_students(path, ["walker-run"])
+    assert len(timed) == 3  # they are measured
+    experiments.time_students(path, ["walker-run", "cheetah-run"])
+    assert len(timed) == 3 + 4  # but for one
 
 
 def test_a_preset_s_students_have_its_budget_and_a_folder_of_their_own(monkeypatch):
     seen = []
     monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: (
-        seen.extend(runs), {"out": "none.csv", "now": 0})[1])
-    monkeypatch.setattr(experiments, "time_students", None)  # where nothing is new
+        seen.extend(runs), {"out": "none.csv"})[1])
+    monkeypatch.setattr(experiments, "time_students", lambda path, tasks: None)
     for flags in ([], ["--preset", "paper"], ["--preset", "paper", "--steps", "14000", "--samples",
                                               "128", "--iterations", "4"]):
         assert experiments.main(["students", "--tasks", "walker-run", "--seeds", "0", *flags]) == 0

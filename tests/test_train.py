@@ -363,15 +363,16 @@ def test_the_expert_learns_from_segments_with_other_targets(monkeypatch):
 
 def test_evaluations_and_their_ratio_are_of_whom_they_name(monkeypatch, tmp_path):
     found = training("--episodes", "1")
-    found.curve = [{"decisions": 500}]
+    found.curve = [{"decisions": 500, "return_mean": 1}]
     found.note([(1, "expert"), (2, "student")], [[(np.float32([3, 4]), False)],
                                                  [(np.float32([1, 1]), False)]])
-    assert found.curve == [{"decisions": 500, "eval_expert": 7, "eval_student": 2}]
+    assert found.curve == [{"decisions": 500, "return_mean": 1, "eval_expert": 7,
+                            "eval_student": 2}]
     found.buffer.add(*episode(np.random.default_rng(0), 1))
     workers = []
     monkeypatch.setattr(fac, "evaluate", lambda *where: (workers.append(where[5]), {
         "returns": [4.0 if where[6].endswith("student") else 8.0], "plan_ms_median": 1.0})[1])
-    monkeypatch.setattr(train_expert, "draw", lambda *_: True)
+    monkeypatch.setattr(train_expert, "draw_lines", lambda *_: True)
     assert train_expert.export(found, tmp_path, {"updates": 0})["ratio"] == 0.5
     assert workers == [1, 1]  # --workers
 
