@@ -704,9 +704,7 @@ import contextlib
 import csv
 import difflib
 import importlib.metadata
-import itertools
 import json
-import math
 import multiprocessing
 import operator
 import os
@@ -785,52 +783,45 @@ def check_settings(config):
     together. 1 becomes 1.0 where a float is meant, and NumPy's numbers Python's."""
     for f in dataclasses.fields(config):
         value, cls = getattr(config, f.name), type(f.default)
-        if np.dtype(type(value)).kind not in {int: "iu", float: "iuf", bool: "b"}.get(cls, "U"):
-            refuse(config, f.name, f"of type {cls.__name__}")
+        kinds = {int: "iu", float: "iuf", bool: "b"}.get(cls, "U")
+        need_setting(config, f.name, np.dtype(type(value)).kind in kinds, f"of type {cls.__name__}")
         rules = [(words.format(f.metadata[bound]), holds(value, f.metadata[bound]))
                  for bound, (words, holds) in RANGE.items() if bound in f.metadata]
         if cls is float:
             rules.append(("finite, as a float32", abs(value) < 3e38))
         elif cls is int and value > 10 ** 9:
             rules.append(("at most 10^9", False))
-        if not all(holds for _, holds in rules):
-            refuse(config, f.name, " and ".join(words for words, _ in rules))
+        need_setting(config, f.name, all(holds for _, holds in rules),
+                     " and ".join(words for words, _ in rules))
         object.__setattr__(config, f.name, cls(value))
-    for name, holds, rule in TOGETHER.get(type(config), lambda _: ())(config):
-        if not holds:
-            refuse(config, name, rule)
+    for name, holds, rule in rules_together(config):
+        need_setting(config, name, holds, rule)
 
 
-def refuse(config, name, rule):
-    """UserError for the value of a config's field `name`."""
-    raise UserError(f"{type(config).__name__}: {name} must be {rule}, not "
-                    f"{getattr(config, name)!r}")
+def need_setting(config, name, holds, rule):
+    """UserError for the value of a config's field `name` unless it holds what a rule says."""
+    need(holds, f"{type(config).__name__}: {name} must be {rule}, not {getattr(config, name)!r}")
 
 
-def _model_rules(config):
-    agents, each = divisors(config.dim_action), map(str, range(config.dim_action))
-    yield ("num_agents", config.num_agents in agents,
-           f"one of {agents}, as {config.dim_action} action dimensions are shared evenly")
-    groups = [group.split(",") for group in config.groups.split("/")]
-    yield ("groups", not config.groups or len(groups) == config.num_agents and
-           len({len(group) for group in groups}) == 1 and sorted(sum(groups, [])) == sorted(each),
-           "equally many action dimensions for each agent (one array holds all), each of 0 to "
-           f"{config.dim_action - 1} once, as --agents 0,2/1,3")
-
-
-def _planner_rules(config):
-    T = episode_steps(config.action_repeat)
-    yield "horizon", config.horizon < T, f"below {T}, an episode's decisions"
-    yield "elites", config.elites <= config.samples, f"at most samples ({config.samples})"
-    yield "min_std", config.min_std <= config.max_std, f"at most max_std ({config.max_std})"
-
-
-def _distill_rules(config):
-    yield ("played_share", config.played_share or not config.expert_episodes,
-           "above 0 where there are expert_episodes")
-
-
-TOGETHER = {ModelConfig: _model_rules, PlannerConfig: _planner_rules, DistillConfig: _distill_rules}
+def rules_together(config):
+    """(field, whether it holds, rule) of what a config's values have to fulfil together."""
+    if isinstance(config, ModelConfig):
+        agents, each = divisors(config.dim_action), map(str, range(config.dim_action))
+        yield ("num_agents", config.num_agents in agents,
+               f"one of {agents}, as {config.dim_action} action dimensions are shared evenly")
+        groups = [group.split(",") for group in config.groups.split("/")]
+        alike = len(groups) == config.num_agents and len({len(group) for group in groups}) == 1
+        yield ("groups", not config.groups or alike and sorted(sum(groups, [])) == sorted(each),
+               "equally many action dimensions for each agent (one array holds all), each of 0 to "
+               f"{config.dim_action - 1} once, as --agents 0,2/1,3")
+    elif isinstance(config, PlannerConfig):
+        T = episode_steps(config.action_repeat)
+        yield "horizon", config.horizon < T, f"below {T}, an episode's decisions"
+        yield "elites", config.elites <= config.samples, f"at most samples ({config.samples})"
+        yield "min_std", config.min_std <= config.max_std, f"at most max_std ({config.max_std})"
+    elif isinstance(config, DistillConfig):
+        yield ("played_share", config.played_share or not config.expert_episodes,
+               "above 0 where there are expert_episodes")
 
 
 def from_dict(config_class, values, where):
@@ -956,32 +947,19 @@ def credit(expert, tapes, actions, predicted, sizes):
     return [parts[:, 0], parts[:, 1], parts[:, 1]]
 
 
-def credited_batch(expert, student, obs, actions, config, rng):
-    """`perturbed_batch` with each agent's part of the expert's predictions; copy 0 is what
-    `actions` say."""
-    perturbed, z = perturbed_actions(actions, config, rng), expert.encode(obs)
-    perturbed[..., :1] = actions[..., :1]
-    predicted = predict(expert, z, perturbed, tapes := defaultdict(list))
-    parts = credit(expert, tapes, perturbed, predicted, student.config)
-    return student.features(obs, z), perturbed, parts
-
-
 def taught_batch(expert, student, obs, actions, config, rng):
-    """`perturbed_batch` or `credited_batch`, by the config's `targets`, whose actions (L, A, B, K)
-    are in the order of the student's agents."""
-    batch = credited_batch if config.targets == "credit" else perturbed_batch
-    features, perturbed, targets = batch(expert, student, obs, actions, config, rng)
+    """`perturbed_batch` for the config's `targets`: if these are "credit", each agent's part of the
+    expert's predictions, and copy 0 is what `actions` say. Perturbed actions (L, A, B, K) are in
+    the order of the student's agents."""
+    if config.targets == "joint":
+        features, perturbed, targets = perturbed_batch(expert, student, obs, actions, config, rng)
+    else:
+        perturbed, z = perturbed_actions(actions, config, rng), expert.encode(obs)
+        perturbed[..., :1] = actions[..., :1]
+        predicted = predict(expert, z, perturbed, tapes := defaultdict(list))
+        targets = credit(expert, tapes, perturbed, predicted, student.config)
+        features = student.features(obs, z)
     return features, perturbed[:, agent_order(student.config)], targets
-
-
-def teacher_of(model, config):
-    """The expert whose policy plans begin from: a student's, or the model itself. UserError: it has
-    none, and the config wants one."""
-    teacher = model.expert or model
-    need(config.prior == "none" or teacher.has_policy, "the model holds no policy of an expert for "
-         "plans to begin from, since the expert has none or the student's encoder reads the "
-         "observation; pass --plan-prior none (evaluate: --prior none)")
-    return teacher
 
 
 # ==== 8. The same, in less time =======================================================
@@ -1102,7 +1080,7 @@ class Distiller:
         if number != self._number:
             lengths = np.diff(np.r_[0:self.pool_size:PART, self.pool_size])
             features, actions, targets = zip(*self._threads.map(
-                self.draw, itertools.repeat(number), itertools.count(), lengths))
+                self.draw, [number] * len(lengths), range(len(lengths)), lengths))
             self._pool = (np.concatenate(features, 2), np.concatenate(actions, 2),
                           [np.concatenate(target, -2) for target in zip(*targets)])
             rng, self._number = stream(self.seed, "order", number), number
@@ -1466,7 +1444,8 @@ NO_ARRAY = TypeError, ValueError, RuntimeError  # of what NumPy can't take; the 
 
 
 def checked(values, shape, what, dtype=F32):
-    """A copy of values of this shape. UserError: of another one, not finite."""
+    """A copy of values of this shape: a robot may use its array again. UserError: of another one,
+    not finite."""
     try:
         with np.errstate(all="ignore"):  # what is too large is infinite
             found = np.array(values, dtype)
@@ -1476,11 +1455,6 @@ def checked(values, shape, what, dtype=F32):
     need(found.shape == shape, f"{what}: expected shape {shape}, found {found.shape}")
     need(np.isfinite(found).all(), f"{what}: holds values that are not finite")
     return found
-
-
-def observed(obs, sizes, what="observation"):
-    """A copy, float32 (O,): a robot may use its array again. UserError: other shape, not finite."""
-    return checked(obs, (sizes.dim_obs,), what)
 
 
 class Planner(contextlib.ExitStack):  # whose `close` ends the workers
@@ -1497,7 +1471,10 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
 
     def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
         self.model, self.config, sequence = model, config, seed_sequence(seed)
-        self._teacher = teacher_of(model, config)
+        self._teacher = model.expert or model
+        need(config.prior == "none" or self._teacher.has_policy, "the model holds no policy of an "
+             "expert for plans to begin from, since the expert has none or the student's encoder "
+             "reads the observation; pass --plan-prior none (evaluate: --prior none)")
         check_memory(planning_numbers(model.config, config), config, model.config)
         self._parts = split_agents(model.config.num_agents, workers)
         own, *others = ((some_agents(model, part.start, part.stop), config)
@@ -1518,7 +1495,8 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
 
     def act(self, obs):
         """obs (O,) -> action (A,), float32 in [-1, 1]. UserError: other shape, NaN, no finite G."""
-        obs, prior = observed(obs, self.model.config)[:, None], None
+        obs = checked(obs, (self.model.config.dim_obs,), "observation")[:, None]
+        prior = None
         with one_thread():
             z = self.model.encode(obs)
             if self.config.prior == "policy":
@@ -1672,12 +1650,9 @@ def import_dm_control(render=False):
     return suite, control, reacher
 
 
-GYM = "gym:"  # before a task's ID in Gymnasium
-
-
 def is_gym(task):
-    """Whether a task is one of Gymnasium's."""
-    return str(task).startswith(GYM)
+    """Whether a task is one of Gymnasium's, gym:ID."""
+    return str(task).startswith("gym:")
 
 
 def make_robot(task, action_repeat=None):
@@ -1690,7 +1665,7 @@ def make_robot(task, action_repeat=None):
     with optional("gymnasium, and a clone of the repository", "gym"):
         from gym_robot import GymRobot
     try:
-        return GymRobot(task[len(GYM):], repeat)
+        return GymRobot(task.removeprefix("gym:"), repeat)
     except ValueError as error:
         raise UserError(f"{task}: {error}") from None
 
@@ -1698,11 +1673,6 @@ def make_robot(task, action_repeat=None):
 def task_repeat(task):
     """A task's control steps a decision, where a file or a setting names no others."""
     return 1 if is_gym(task) else ACTION_REPEAT
-
-
-def task_steps(task, config):
-    """T: decisions in an episode of a task, at most, with the action repeat of a PlannerConfig."""
-    return gym_sizes(task, config.action_repeat)[2] if is_gym(task) else robot_steps(None, config)
 
 
 class Environment:
@@ -1769,7 +1739,7 @@ def robot_step(robot, action, sizes, t):
     except NO_ARRAY:
         number = np.nan
     need(np.isfinite(number), f"decision {t}: expected a finite reward, found {shown(reward)}")
-    obs = observed(obs, sizes, f"decision {t}: observation")
+    obs = checked(obs, (sizes.dim_obs,), f"decision {t}: observation")
     return obs, number, any(ends), any(ends[:1])
 
 
@@ -1817,7 +1787,7 @@ def suite_sizes(task):
     need(steps == CONTROL_STEPS, f"{task}: its episodes have {steps} control steps; expected "
          f"{CONTROL_STEPS}")
     spec = env.observation_spec().values()
-    return sum(math.prod(s.shape) for s in spec), math.prod(env.action_spec().shape)
+    return sum(int(np.prod(s.shape)) for s in spec), int(np.prod(env.action_spec().shape))
 
 
 def episode_seeds(seed, episodes, first=0):
@@ -1978,9 +1948,10 @@ class Replay:
     """The dataset of Algorithm 1 [D6]: transitions in order, episode after episode.
 
     observation (M, O) and action (M, A) float16 or float32, continues (M,): False in an episode's
-    last row, whose action stands for nothing. Raises UserError for anything else."""
+    last row, whose action stands for nothing. Raises UserError for anything else, and for a file
+    that names another action repeat than `repeat`, the expert's, if given."""
 
-    def __init__(self, path):
+    def __init__(self, path, repeat=None):
         self.path = path
         self.header, arrays = read_npz(path, ("replay",))
         for key, rank, kinds in (("observation", 2, "float16, float32"), ("continues", 1, "bool"),
@@ -1998,6 +1969,10 @@ class Replay:
         self.transitions = len(self.observation) - len(self.ends)
         need(self.ends[-1:].tolist() == [len(self.observation) - 1],
              f"{path}: continues: expected False in the last row, {len(self.observation) - 1}")
+        if repeat:
+            found = made_for(self.header, path).get("action_repeat", repeat)
+            need(found == repeat, f"{path}: header: action_repeat: expected {repeat}, as the "
+                 f"expert was made for, found {found}; pass its own data")
 
     def starts(self, length, held_out, seed=0):
         """Rows from which `length` actions stay in their episode: (training, held-out) rows.
@@ -2021,15 +1996,6 @@ class Replay:
         """First observations (O, B) and actions (L, A, B), float32, from the rows `starts` on."""
         actions = self.action[starts + np.arange(length)[:, None]]
         return self.observation[starts].T.astype(F32), actions.swapaxes(1, 2).astype(F32)
-
-
-def load_replay(path, repeat):
-    """A Replay whose file names no other action repeat than this."""
-    replay = Replay(path)
-    found = made_for(replay.header, path).get("action_repeat", repeat)
-    need(found == repeat, f"{path}: header: action_repeat: expected {repeat}, as the expert was "
-         f"made for, found {found}; pass its own data")
-    return replay
 
 
 def checksum(arrays):
@@ -2057,23 +2023,17 @@ def data_file(task, name):
 
 # ==== 12. Commands ====================================================================
 
-def decisions(model, task, config, seeds, environment=None, noise=0.0):
-    """Plan through the episode of each seed; yields every decision's observation (O,), action
-    (A,), reward and seconds of planning; past its end up to T NaN, reward 0. environment: instead
-    of the task's, see `robot_step`; with T as `episode_steps` if it has that. noise: each episode
-    draws the deviation of what is added to its actions, evenly from 0 to this."""
+def episodes_of(model, task, config, seeds, environment, noise):
+    """Plan through the episode of each seed; yields its decisions, a list of observation (O,),
+    action (A,), reward and seconds of planning. environment, noise: as `play`'s."""
     environment = make_robot(task, config.action_repeat) if environment is None else environment
     planner, sizes = Planner(model, config), model.config
-    past = np.full(sizes.dim_obs, np.nan), np.full(sizes.dim_action, np.nan), 0.0, np.nan
     for seed in seeds:
         planner.reset(seed)
-        obs = observed(environment.reset(seed), sizes, "reset: observation")
-        rng = stream(seed, "exploration")
-        deviation, over = F32(rng.uniform(0, noise)), False
+        obs = checked(environment.reset(seed), (sizes.dim_obs,), "reset: observation")
+        rng, decisions = stream(seed, "exploration"), []
+        deviation = F32(rng.uniform(0, noise))
         for t in range(robot_steps(environment, config)):
-            if over:
-                yield past
-                continue
             begin = time.perf_counter()
             action = planner.act(obs)
             seconds = time.perf_counter() - begin
@@ -2081,15 +2041,17 @@ def decisions(model, task, config, seeds, environment=None, noise=0.0):
                 action = action + deviation * rng.standard_normal(action.shape, F32)
                 action = np.clip(action, -1, 1)
             before, (obs, reward, over, _) = obs, robot_step(environment, action, sizes, t)
-            yield past if obs is None else (before, action, reward, seconds)
+            if obs is not None:
+                decisions.append((before, action, reward, seconds))
+            if over:
+                break
+        yield decisions
 
 
 def _playing_worker(connection):
-    """Sends the decisions of its episodes, so many at a time."""
-    count, *what = connection.recv()
-    played = decisions(*what)
-    while part := list(itertools.islice(played, count)):
-        connection.send(part)
+    """Sends its episodes, one after the other."""
+    for decisions in episodes_of(*connection.recv()):
+        connection.send(decisions)
 
 
 def play(model, task, config, seeds, workers=None, label="playing", environment=None, noise=0.0):
@@ -2098,32 +2060,28 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
     are NaN, its rewards 0.
 
     workers: processes that share the episodes [one for each core]; 0, or with an `environment`: all
-    in this one. An episode depends on its seed, not on their number. noise: as `decisions`'s."""
-    T = task_steps(task, config) if environment is None else robot_steps(environment, config)
-    E, sizes = len(seeds), model.config
-    at_once = math.gcd(T, 25)  # decisions of a worker's message: of one episode
-    found = [np.zeros((E, T, *shape), F32) for shape in ((sizes.dim_obs,), (sizes.dim_action,))]
-    found += [np.zeros((E, T)) for _ in range(2)]
+    in this one. An episode depends on its seed, not on their number. environment: instead of the
+    task's, see `robot_step`; with T as `episode_steps` if it has that. noise: each episode draws
+    the deviation of what is added to its actions, evenly from 0 to this."""
+    E, sizes, episodes, total = len(seeds), model.config, [], 0.0
     workers = 0 if environment is not None else min(
         E, cores() if workers is None else count(workers, "workers"))
-    parts = [range(w, E, workers or 1) for w in range(workers or 1)]
-    here, done = decisions(model, task, config, seeds, environment, noise), [0] * len(parts)
-    with progress(label, E * T, "decision") as bar, \
+    here = episodes_of(model, task, config, seeds, environment, noise)
+    with progress(label, E, "episode") as bar, \
             Workers(_playing_worker, workers, "evaluation worker") as pool:
-        pool.send_all((at_once, model, task, config, [seeds[i] for i in part], None, noise)
-                      for part in parts)
-        while sum(done) < E * T:  # a disabled bar doesn't count
-            for w, part in enumerate(parts):
-                if done[w] < len(part) * T:
-                    played = pool.receive(w) if workers else list(itertools.islice(here, at_once))
-                    i, t = part[done[w] // T], done[w] % T
-                    for array, values in zip(found, zip(*played)):
-                        array[i, t:t + len(played)] = values
-                    done[w] += len(played)
-            bar.update(sum(done) - bar.n)
-            bar.set_postfix_str(f"mean return about {found[2].sum() * T / sum(done):.0f}", False)
-    longest = np.isfinite(found[0][..., 0]).sum(1).max(initial=0)
-    return [array[:, :longest] for array in found]
+        pool.send_all((model, task, config, seeds[w::workers], None, noise) for w in range(workers))
+        for i in range(E):
+            episodes.append(pool.receive(i % workers) if workers else next(here))
+            total += sum(reward for *_, reward, _ in episodes[i])
+            bar.update()
+            bar.set_postfix_str(f"mean return {total / (i + 1):.0f}", False)
+    T = max(map(len, episodes), default=0)
+    found = [np.full((E, T, n), np.nan, F32) for n in (sizes.dim_obs, sizes.dim_action)]
+    found += [np.zeros((E, T)), np.full((E, T), np.nan)]
+    for i, decisions in enumerate(episodes):
+        for array, values in zip(found, zip(*decisions)):
+            array[i, :len(decisions)] = values
+    return found
 
 
 def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="evaluating"):
@@ -2360,9 +2318,8 @@ def command_distill(args):
     read_records(path)  # what is damaged is missed now
     with contextlib.closing(distiller_class(expert, replay, config, args.num_agents,
                                             args.seed)) as distiller, locked(out):
-        for model, config in ((expert, own), (distiller.student, planning)):
-            check_memory(planning_numbers(model.config, config), config, model.config)
-        teacher_of(distiller.student, planning)  # what is missing is missed now
+        for planned in ((expert, own), (distiller.student, planning)):
+            Planner(*planned)  # what is missing, or too large, is missed now
         result, planning = distil_and_save(distiller, args, planning, header, out)
         obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
         both = (expert, own), (distiller.student, planning)
@@ -2384,9 +2341,10 @@ def load_data(args):
     need(header.get("task") == args.task, f"{path}: header: task: expected {args.task!r}, found "
          f"{header.get('task')!r}")
     check_task(expert.config, args.task)
-    is_gym(args.task) or make_robot(args.task)  # what is missing is missed now, not at the end
-    replay = load_replay(args.replay or path.with_name("replay.npz"),
-                         made_for(header, path).get("action_repeat", ACTION_REPEAT))
+    if not is_gym(args.task):  # whose sizes were a robot's
+        make_robot(args.task)  # what is missing is missed now, not after the last step
+    replay = Replay(args.replay or path.with_name("replay.npz"),
+                    made_for(header, path).get("action_repeat", ACTION_REPEAT))
     return expert, header, replay, path
 
 
@@ -2558,10 +2516,8 @@ def add_config(parser, config_class, title=None, prefix="", skip=(), **defaults)
     for f in dataclasses.fields(config_class):
         if f.name in skip:
             continue
-        default, paper = defaults.get(f.name, f.default), f.metadata.get("paper")
-        if paper is None and default != f.default:
-            paper = f.default
-        shown = f"{default}" if paper is None else f"{default}; paper: {paper}"
+        default, paper = defaults.get(f.name, f.default), f.metadata.get("paper", f.default)
+        shown = f"{default}" if paper == default else f"{default}; paper: {paper}"
         kind = {"action": argparse.BooleanOptionalAction}
         if not isinstance(default, bool):
             choices = f.metadata.get("choices")

@@ -32,7 +32,7 @@ def shares(model, z, config, obs=None):
     n = model.config.num_agents
     returns = functools.partial(fac.h_step_return, model, z, config=config)
     nothing = np.zeros((n, config.horizon + 1, model.config.agent_actions), fac.F32)
-    first = fac.policy_plan(fac.teacher_of(model, config), obs, config.horizon + 1, model.config)[
+    first = fac.policy_plan(model.expert or model, obs, config.horizon + 1, model.config)[
         ..., 0] if config.prior == "policy" else nothing
     plan, _, _ = fac.mppi(returns, first, config, [np.random.default_rng(0) for _ in range(n)])
     worth = returns(np.stack([plan, nothing], -1))

@@ -80,7 +80,7 @@ def load_data(task, args, checkpoint, seed, folder):
     if args.collect:
         path = collect(expert, task, args.collect, seed, folder)
     fac.need(path.exists(), f"{path}: no such file; --collect 20 has the teacher play instead")
-    return expert, fac.PlannerConfig(), fac.load_replay(path, fac.ACTION_REPEAT)
+    return expert, fac.PlannerConfig(), fac.Replay(path, fac.ACTION_REPEAT)
 
 
 def collect(expert, task, episodes, seed, folder):

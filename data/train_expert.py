@@ -42,6 +42,12 @@ CURVE = ("decisions", "updates", "seconds", "exploration_std", "horizon", "retur
 
 # --------------------------------------------------------------------------------- acting
 
+def task_steps(task, config):
+    """T: decisions in an episode of a task, at most, with the action repeat of a PlannerConfig."""
+    repeat = config.action_repeat
+    return fac.gym_sizes(task, repeat)[2] if fac.is_gym(task) else fac.episode_steps(repeat)
+
+
 class Episode:
     """An episode that is played in parts, so that each can plan with newer weights.
 
@@ -52,8 +58,8 @@ class Episode:
     def __init__(self, environment, seed, player=None, exploration_std=None):
         self.environment, self.seed, self.player = environment, seed, player
         self.exploration_std, self.rng = exploration_std, fac.stream(seed, "exploration")
-        self.observation = [fac.observed(environment.reset(seed), environment,
-                                         "reset: observation")]
+        self.observation = [fac.checked(environment.reset(seed), (environment.dim_obs,),
+                                        "reset: observation")]
         self.action, self.reward, self.over, self.terminated = [], [], False, False
         self._warm_start = None
 
@@ -362,7 +368,7 @@ class Training:
             sizes, config.batch_size * (config.horizon + 1)), config)
         fac.check_memory(fac.planning_numbers(sizes, planning), planning, sizes)
         self.learner = make_learner(args, sizes, config)
-        self.steps = fac.task_steps(args.task, planning)
+        self.steps = task_steps(args.task, planning)
         new_buffer = functools.partial(ReplayBuffer, dim_obs, dim_action, config.buffer_size,
                                        np.dtype(config.buffer_dtype), self.steps)
         self.buffer = new_buffer()
@@ -577,7 +583,7 @@ def read_settings(args):
         raise fac.UserError(f"training: std_start must lie between the planner's min_std and "
                             f"max_std ({planning.min_std}, {planning.max_std}), not "
                             f"{config.std_start}")
-    quota = args.envs * fac.task_steps(args.task, planning)
+    quota = args.envs * task_steps(args.task, planning)
     if args.steps is None:
         args.steps = -(-DECISIONS // quota) * quota
     fac.need(args.steps and args.steps % quota == 0, f"--envs {args.envs} needs --steps of whole "
