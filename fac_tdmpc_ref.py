@@ -2284,9 +2284,11 @@ def software():
             "mujoco": importlib.metadata.version("mujoco")}
 
 
-def recorded_returns(path, model, config, seed):
-    """(returns, the `software` they are of) that `record_returns` kept; ([], {}): none."""
-    return read_records(path).get(record_key(model, config, seed), ([], {}))
+def recorded_returns(path, model, task, config, seed):
+    """(returns, the `software` they are of) that `record_returns` kept; ([], {}): none, or the
+    task's robot is a user's own, gym:MODULE:ID, and may have changed."""
+    records = {} if task.count(":") > 1 else read_records(path)
+    return records.get(record_key(model, config, seed), ([], {}))
 
 
 def record_returns(path, model, config, seed, returns):
@@ -2405,9 +2407,8 @@ def evaluate_both(expert, student, path, args):
     measured: result's part. expert, student: (model, planning), each over its own horizon."""
     found = {"episodes": args.episodes, "eval_seed": args.eval_seed}
     for name, (model, planning) in compared(expert, student).items():
-        returns, versions = recorded_returns(path, model, planning, args.eval_seed)
-        recorded = len(returns) >= args.episodes and not (
-            args.evaluate_expert or args.task.count(":") > 1)  # gym:MODULE:ID may have changed
+        returns, versions = recorded_returns(path, model, args.task, planning, args.eval_seed)
+        recorded = len(returns) >= args.episodes and not args.evaluate_expert
         if not recorded:
             versions, returns = software(), evaluate(
                 model, args.task, planning, args.episodes, args.eval_seed, args.workers,

@@ -670,7 +670,7 @@ def expert_level(task, rows):
     weights = fac.checksum(expert.params.values())
     if about.get("data", [weights])[0] != weights:
         return None
-    returns, _ = fac.recorded_returns(path, expert, planning_for(header, about), 0)
+    returns, _ = fac.recorded_returns(path, expert, task, planning_for(header, about), 0)
     return float(np.mean(returns[:about.get("episodes")])) if returns else None
 
 

@@ -176,12 +176,10 @@ def command_distill(args):
 # ---------------------------------------------------------------------------------- evaluate
 
 def recorded(expert, header, path, episodes, seed, workers=0):
-    """The returns of an expert's episodes: those in its record; else, or of gym:MODULE:ID, which
-    may have changed, measured."""
+    """The returns of an expert's episodes: those in its record; else measured."""
     planning = fac.PlannerConfig(**fac.made_for(header, path))
-    found, _ = fac.recorded_returns(path, expert, planning, seed)
-    known = len(found) >= episodes and header["task"].count(":") < 2
-    return found[:episodes] if known else fac.evaluate(
+    found, _ = fac.recorded_returns(path, expert, header["task"], planning, seed)
+    return found[:episodes] if len(found) >= episodes else fac.evaluate(
         expert, header["task"], planning, episodes, seed, workers,
         "evaluating the teacher")["returns"]
 

@@ -678,9 +678,11 @@ def export(training, out, result):
         result["lag"] = {str(p): lag(training.curve, p / 100) for p in (50, 75, 90)}
         if args.episodes:
             result["ratio"] = fac.return_kept(result["student_return_mean"], result["return_mean"])
-    lines = {label: {row["decisions"]: [row[key]] for row in training.curve if row[key] is not None}
-             for key, label in (("return_mean", "training episodes"), ("eval_expert", "expert"),
-                                ("eval_student", "student")) if training.curve[-1][key] is not None}
+    lines = {}
+    for key, label in (("return_mean", "training episodes"), ("eval_expert", "expert"),
+                       ("eval_student", "student")):
+        points = {row["decisions"]: [row[key]] for row in training.curve if row[key] is not None}
+        lines.update({label: points} if points else {})
     fac.drawn(draw_lines, out / "curve.png", {f"{args.task}, seed {args.seed}": (lines, None)},
               "decisions")
     print(f"\n{args.task}: {training.decisions:,} decisions, {result['updates']:,} updates, "
