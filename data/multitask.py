@@ -30,7 +30,7 @@ from tdmpc2 import Checkpoint  # noqa: E402
 # ----------------------------------------------------------------------------------- distill
 
 MOST_ACTIONS = 6  # of the paper's robots here
-MARKS = (0.03, 0.1, 0.3, 1.0)  # shares of the steps after which Figure 10's students play
+MARKS = (0.1, 0.3, 1.0)  # shares of the steps after which Figure 10's students play
 
 
 def named(tasks):
@@ -255,8 +255,9 @@ TEACHER, POLICY = "teacher", "its policy alone"
 
 
 def play_marks(task, seed, case, settings, folder, data):
-    """Rows of a task's returns: of a student after each of `marked` steps, planning alone or around
-    its teacher's policy; or of the teacher; or of its policy alone."""
+    """Rows of a task's returns: of a student after each of `marked` steps, planning alone (with the
+    ranks of its predictions) or around its teacher's policy; or of the teacher; or of its policy
+    alone."""
     expert, header, path = load_expert(task, data)
     episodes, steps = settings["episodes"], settings["steps"]
     own = fac.made_for(header, path)
@@ -270,9 +271,22 @@ def play_marks(task, seed, case, settings, folder, data):
         planning = fac.PlannerConfig(**{**own, "horizon": settings["horizon"], **(
             fac.STUDENT_PLANNING if case.endswith(AROUND) else {})})
         for step in marked(steps):
-            student, _ = load(student_folder(folder, seed, case) / f"step-{step}.npz")
-            yield {"step": step, **experiments.measure(student.of_task(task, expert), task,
-                                                       planning, episodes)}
+            student, about = load(student_folder(folder, seed, case) / f"step-{step}.npz")
+            student, ranks = student.of_task(task, expert), {}
+            if case in CASES:
+                q, g = ranks_of(student, load_path(task, data, "replay.npz"), about,
+                                planning.discount)
+                ranks = {"rank_q": float(q[0]), "rank_return": float(g[-1])}
+            yield {"step": step, **ranks, **experiments.measure(student, task, planning, episodes)}
+
+
+def ranks_of(student, replay, header, discount):
+    """Distiller.ranks of one task's student in states that a multi-task run has held out."""
+    config = fac.from_dict(fac.DistillConfig, header["distill"], "a student's header: distill")
+    with contextlib.closing(fac.Distiller(student.expert, fac.Replay(replay), config,
+                                          seed=header["seed"])) as distiller:
+        distiller.student = student
+        return distiller.ranks(256, discount)
 
 
 def student_folder(folder, seed, case):
@@ -280,9 +294,9 @@ def student_folder(folder, seed, case):
     return Path(folder) / f"{seed}" / case.removesuffix(AROUND)
 
 
-def over_tasks(rows, tasks):
+def over_tasks(rows, tasks, column="return_mean"):
     """`experiments.curves` of runs, and before them the mean over tasks, seed by seed."""
-    found = experiments.curves(rows)
+    found = experiments.curves(rows, column)
     mean = {case: {step: np.mean([found[task][case][step] for task in tasks], 0).tolist()
                    for step in points} for case, points in found[tasks[0]].items()}
     return {f"mean of {len(tasks)} tasks": mean, **{task: found[task] for task in tasks}}
@@ -313,28 +327,33 @@ def command_figure10(args):
         play_marks, folder=args.students, data=args.data), runs)
     fac.need(not result["failed"], f"{result['out']}: {result['failed']} runs failed")
     done = experiments.finished(experiments.read_rows(result["out"]))
-    found = over_tasks({key: done[key] for key in map(experiments.key_of, runs)}, args.tasks)
+    rows = {key: done[key] for key in map(experiments.key_of, runs)}
+    found, ranks = over_tasks(rows, args.tasks), over_tasks(rows, args.tasks, "rank_return")
     experiments.draw_lines(args.picture, {
         title: ({case: cases[case] for case in cases if case != TEACHER},  # which is the level
                 cases[TEACHER][config.steps][0]) for title, cases in found.items()},
         "gradient step")
-    print_figure10(found, marked(config.steps))
+    print_figure10(found, ranks, marked(config.steps))
     compared, picture = {}, Path(args.picture).with_name(f"{Path(args.picture).stem}-latents.png")
     for seed, (student, _) in students.items():
         compared[seed] = latents.compare(functools.partial(
             latents_of, student, args.data, config.held_out, seed), student.dims, 100, seed,
             None if compared else picture)
         latents.print_tables(compared[seed])
-    return {**result, "returns": found, "latents": compared, "picture": args.picture}
+    return {**result, "returns": found, "ranks": ranks, "latents": compared, "picture": args.picture}
 
 
-def print_figure10(found, steps):
-    """A table for the mean and for each task: mean returns, over seeds, after these steps."""
+def print_figure10(found, ranks, steps):
+    """A table for the mean and for each task: mean returns, over seeds, after these steps, and rank
+    correlations of G."""
+    def cell(title, case, step):
+        own, rank = ({s: v for s, v in of[title][case].items() if s == step}
+                     for of in (found, ranks))
+        return experiments.cell(experiments.last(own, rank) if own else None)
+
     for title, cases in found.items():
         fac.print_table([(title, *(f"{step:,} steps" for step in steps)), *(
-            (case, *(experiments.cell(experiments.last({step: points[step]}, None)
-                                      if step in points else None) for step in steps))
-            for case, points in cases.items())])
+            (case, *(cell(title, case, step) for step in steps)) for case in cases)])
         print()
 
 
