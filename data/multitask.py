@@ -340,7 +340,8 @@ def command_figure10(args):
             latents_of, student, args.data, config.held_out, seed), student.dims, 100, seed,
             None if compared else picture)
         latents.print_tables(compared[seed])
-    return {**result, "returns": found, "ranks": ranks, "latents": compared, "picture": args.picture}
+    return {**result, "returns": found, "ranks": ranks, "latents": compared,
+            "picture": args.picture}
 
 
 def print_figure10(found, ranks, steps):
