@@ -34,6 +34,8 @@ class ExpertConfig(fac.Settings):
     std_steps: int = fac.field(25_000, "decisions over which it falls to the planner's min_std",
                                least=0)
     seed_decisions: int = fac.field(4_000, "random decisions before the first update", least=0)
+    random_hold: int = fac.field(0, "decisions that each of these holds, all joints at a limit, "
+                                 "where reward is a swing away; 0: uniform, anew each", least=0)
     buffer_size: int = fac.field(1_000_000, "replay capacity, transitions (Table 2)", least=1)
     buffer_dtype: str = fac.field("float32", "how the replay is kept in memory",
                                   choices=("float32", "float16"))

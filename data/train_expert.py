@@ -53,11 +53,13 @@ class Episode:
 
     `observation` (T + 1, O), `action` (T, A) and `reward` (T,) grow as lists. They depend on the
     seed and on the planners that `player`, a name, stood for. exploration_std: None in a test.
+    hold: ExpertConfig's `random_hold`.
     """
 
-    def __init__(self, environment, seed, player=None, exploration_std=None):
+    def __init__(self, environment, seed, player=None, exploration_std=None, hold=0):
         self.environment, self.seed, self.player = environment, seed, player
         self.exploration_std, self.rng = exploration_std, fac.stream(seed, "exploration")
+        self.hold = hold
         self.observation = [fac.checked(environment.reset(seed), (environment.dim_obs,),
                                         "reset: observation")]
         self.action, self.reward, self.over, self.terminated = [], [], False, False
@@ -85,11 +87,14 @@ class Episode:
     def next(self):
         """The one that begins after it, unless it is a test."""
         seed = int(fac.stream(self.seed, "next episode").integers(2 ** 31))
-        return Episode(self.environment, seed, self.player, self.exploration_std)
+        return Episode(self.environment, seed, self.player, self.exploration_std, self.hold)
 
     def _explore(self, planner):
         if planner is None:
-            return self.rng.uniform(-1, 1, self.environment.dim_action).astype(np.float32)
+            if self.hold and len(self.action) % self.hold:
+                return self.action[-1]
+            action = self.rng.uniform(-1, 1, self.environment.dim_action).astype(np.float32)
+            return np.sign(action) if self.hold else action
         action = planner.act(self.observation[-1])
         deviation = self.exploration_std or 0.0  # in TD-MPC's code: MPPI's last one, at least this
         noise = deviation * self.rng.standard_normal(action.shape, np.float32)
@@ -138,7 +143,7 @@ class Actors(fac.Workers):
         self.send_all([(task, action_repeat)] * workers)
 
     def begin(self, episodes):
-        """Start episodes: (seed, player, exploration_std) of each, or of a test (seed, player)."""
+        """Start episodes: an Episode's values after its environment of each."""
         self._begun = len(episodes)
         self.send_all(("begin", episodes[i::self._count]) for i in range(self._count))
 
@@ -420,7 +425,7 @@ class Training:
         them."""
         first, std = self.decisions // self.steps, self.scheduled()["exploration_std"]
         follows = self.student and self.student.config.played_share and not self.warming
-        return [(seed, player, deviation) for use, player, deviation, count in (
+        return [(seed, player, deviation, self.config.random_hold) for use, player, deviation, count in (
             ("training episode", "explorer", std, self.args.envs),
             ("own episode", "own", 0.0, self.args.envs if follows else 0))
             for seed in fac.training_seeds(self.args.seed, use, first, count)]
@@ -484,7 +489,7 @@ class Training:
             actors.wait()
             planners = {}
         episodes = actors.episodes()
-        for (_, player, _), played in zip(playing, episodes):
+        for (_, player, *_), played in zip(playing, episodes):
             for episode in played:
                 (self.student.own if player == "own" else self.buffer).add(*episode)
         self.decisions += quota

@@ -26,7 +26,7 @@ from numpy_learner import ExpertConfig  # noqa: E402
 from train_expert import ReplayBuffer  # noqa: E402
 
 # of train_expert.py, what stands still in a CUDA graph or is done otherwise here
-SKIPPED = ("updates_per_step", "seed_decisions", "buffer_dtype", "target_every")
+SKIPPED = ("updates_per_step", "seed_decisions", "random_hold", "buffer_dtype", "target_every")
 DEFAULTS = {"std_steps": 100_000}
 PLANNING = {"iterations": 3}
 COOLING = 0.8  # of the time: from here on the learning rate falls to a tenth

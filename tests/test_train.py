@@ -161,6 +161,22 @@ def test_exploration_adds_noise_of_its_deviation(std):
         assert len(np.unique(noise)) == noise.size
 
 
+@pytest.mark.parametrize("hold", [0, 8])
+def test_random_actions_and_those_that_are_held(hold):
+    """Part by part, as a round plays them, and in the episode that follows."""
+    first = train_expert.Episode(fac.Environment("reacher-easy"), 0, exploration_std=0.1, hold=hold)
+    for episode in (first, first.next()):
+        for decisions in (13, 11, 56):
+            episode.play(None, decisions)
+        actions = np.stack(episode.action)
+        if hold:
+            assert set(np.unique(actions)) == {-1, 1}
+            by_hold = actions.reshape(-1, hold, 3)
+            assert (by_hold == by_hold[:, :1]).all() and len(np.unique(by_hold[:, 0], axis=0)) > 4
+        else:
+            assert len(np.unique(actions)) == actions.size and np.abs(actions).max() < 1
+
+
 def test_an_episode_may_get_new_weights_on_its_way():
     whole = play([(0, 12)])
     assert np.array_equal(play([(0, 5), (0, 7)]), whole)  # warm start and random streams go on
