@@ -425,7 +425,8 @@ class Training:
         them."""
         first, std = self.decisions // self.steps, self.scheduled()["exploration_std"]
         follows = self.student and self.student.config.played_share and not self.warming
-        return [(seed, player, deviation, self.config.random_hold) for use, player, deviation, count in (
+        hold = self.config.random_hold
+        return [(seed, player, deviation, hold) for use, player, deviation, count in (
             ("training episode", "explorer", std, self.args.envs),
             ("own episode", "own", 0.0, self.args.envs if follows else 0))
             for seed in fac.training_seeds(self.args.seed, use, first, count)]
