@@ -9,8 +9,9 @@ action dimension. Each joint then plans alone: cheaper, and in parallel.
 
 Part I is the method, with [D1] to [D5] and [D7], to be read from top to bottom: 1 settings,
 2 layers, 3 world model, 4 distillation (Equation 4, Algorithm 1), 5 planning (Equations 2 and 3).
-It runs (`distill --plain`). Part II adds [D8] and [D9], has it faster, and the engineering. Experts
-learn, by Equation 1, in data/ [D6]. The README lists the departures from the paper, [D1] to [D9].
+It runs (`distill --plain`). Part II adds [D8], [D9], settings that Part I doesn't read, speed and
+the engineering. Experts learn, by Equation 1, in data/ [D6]. The README lists the departures from
+the paper, [D1] to [D9].
 
 The one idea that keeps it small: every model carries an agent axis N, and a centralized model is
 the case N = 1. There is one world model, one planner, one loss. The axes, everywhere:
@@ -60,7 +61,7 @@ def field(default, help, repr=True, **about):
 
 
 class Settings:
-    """Base of the settings below, whose values Part II checks as they are made; and seeds."""
+    """Base of the settings below, whose values Part II checks as they are made."""
 
     def __post_init__(self):
         check_settings(self)
@@ -118,7 +119,7 @@ class DistillConfig(Settings):
     """Algorithm 1. `--preset paper` takes each field's paper value."""
     steps: int = field(14_000, "gradient steps (section 5.1: 10^5) [D1]", paper=100_000, least=1)
     batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=2)
-    noise_samples: int = field(5, "K: perturbations of each action [D1]", paper=10, least=2)
+    noise_samples: int = field(5, "K: copies of actions, perturbed [D1]", paper=10, least=2)
     noise_std: float = field(0.3, "deviation of the noise [D9]", paper=0.5, plain=0.5, above=0)
     targets: str = field("credit", "a share learns its agent's part (credit), or all of them "
                          "the sum [D9]", paper="joint", plain="joint", choices=("credit", "joint"))
@@ -148,7 +149,8 @@ class DistillConfig(Settings):
 
 
 def student_config(theirs, num_agents, encoder_input, policy=False):
-    """A student's ModelConfig, from its expert's; policy: keep it, if its latent is read [D9]."""
+    """A student's ModelConfig, from its expert's, whose width its agents share (at least 50 each);
+    policy: keep it, if its latent is read [D9]."""
     below = {} if encoder_input == "observation" else {
         "expert_latent_dim": theirs.num_agents * theirs.latent_dim,
         "expert_enc_dim": theirs.enc_dim, "expert_mlp_dim": theirs.mlp_dim if policy else 0}
@@ -547,7 +549,7 @@ def learning_rate(config, t):
 
 
 def perturbed_actions(actions, config, rng):
-    """a_h + eps_h (L, A, B, K) of actions (L, A, B, 1), or one a copy; clipped, if wanted [D7]."""
+    """a_h + eps_h (L, A, B, K) of actions (L, A, B, 1); clipped, if wanted [D7]."""
     noise = rng.standard_normal((*actions.shape[:3], config.noise_samples), F32)
     limit = 1 if config.clip_actions else np.inf
     return np.clip(actions + F32(config.noise_std) * noise, -limit, limit)
@@ -563,9 +565,9 @@ def perturbed_batch(expert, student, obs, actions, config, rng):
 def distill(expert, replay, config, num_agents=None, seed=0):
     """Algorithm 1: a factored student of an expert; yields it with each step's losses.
 
-    replay: the dataset; `starts` are rows that H + 1 actions follow, `sequences` g_0 and these.
-    Part II's `Distiller` is this with what is left out: `reuse` [D1], `expert_episodes` and
-    `policy_share` [D8], `targets` [D9]."""
+    replay: the dataset, a `Replay`; `starts` are rows that H + 1 actions follow, to learn from and
+    held out, `sequences` g_0 and these. Part II's `Distiller` is this with what is left out:
+    `reuse` [D1], `expert_episodes` and `policy_share` [D8], `targets` [D9]."""
     agents = expert.config.dim_action if num_agents is None else num_agents
     sizes = student_config(expert.config, agents, config.encoder_input)
     optimizer, student = new_student(expert, sizes, seed)
@@ -583,7 +585,7 @@ def distill(expert, replay, config, num_agents=None, seed=0):
 # ==== 5. Planning: MPPI (Equations 2 and 3) ===========================================
 
 def h_step_return(model, z, actions, config):
-    """Equation 2 for every agent as it reads; `Returns` computes the same faster.
+    """Equation 2 for every agent as it reads; Part II's `Returns` computes the same faster.
 
         G_i = sum_{h=0}^{H-1} gamma^h f_R^i(s_h^i, a_h^i) + gamma^H f_Q^i(s_H^i, a_H^i)
 
@@ -656,15 +658,16 @@ def policy_rollout(model, z, noise):
 
 
 class AgentPlanner:
-    """Plans for all, some or one of a model's agents: each agent's plan depends on its own latent,
-    model, stream and prior alone. Part II has it faster, and in processes."""
+    """Plans for a model's agents, each of whose plans depends on its own latent, model, stream and
+    prior alone. Part II has it faster, and gives processes models of some of the agents."""
 
     def __init__(self, model, config):
         self.model, self.config = model, config
         self.reset()
 
     def reset(self, seeds=()):
-        """Start an episode from a mean of zero; SeedSequences, one an agent, start streams."""
+        """Start an episode from a mean of zero; SeedSequences, one an agent, start streams, as the
+        first episode needs."""
         sizes = self.model.config
         self.mean = np.zeros((sizes.num_agents, self.config.horizon + 1, sizes.agent_actions), F32)
         if seeds:

@@ -817,7 +817,7 @@ over episodes and joints lie, bold without 0 in it; where a row holds no episode
 has the luck that its deviation allows, the same for all joints of a model. '10% TD-MPC' has hidden
 layers of 66 (B.2), which with Table 2's latents of 50 is 3% of the weights behind the encoder; six
 agents have 26%. One agent's layers are as wide as its expert's, N agents' an Nth of that. Figure
-13: latents of 50 an agent, so 50 N in all.
+13: latents of 50 an agent, so 50 N in all. Minutes are of a core while others distil beside it.
 
 """
 REPORTS = {"students": report_students, "figure4": report_curves, "figure5": report_curves,
