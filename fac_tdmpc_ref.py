@@ -1045,7 +1045,8 @@ class Distiller:
             sizes["groups"], agents = agents or ",", agents.count("/") + 1
         needed = config.steps * config.batch_size // config.reuse
         self.pool_size = max(config.batch_size, min(POOL, needed))
-        sizes = dataclasses.replace(student_config(theirs, agents, config.encoder_input,
+        shared = dataclasses.replace(theirs, dim_action=sizes.get("dim_action", theirs.dim_action))
+        sizes = dataclasses.replace(student_config(shared, agents, config.encoder_input,
                                                    expert.has_policy), **sizes)
         copies = config.noise_samples * (config.horizon + 1)  # columns of a state
         check_memory(learning_numbers(sizes, config.batch_size * copies) + copies * (

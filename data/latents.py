@@ -36,9 +36,10 @@ def silhouettes(latents, rng):
 
 
 def recognition(walker, hopper):
-    """Accuracies (chance: 1/3) of a classifier of hip, knee and ankle that learned from one leg's
-    latents (N, m, B): in other states, on another leg, and on the agents of the other robot that
-    have its own slots, whatever they move there."""
+    """Accuracies of a classifier of hip, knee and ankle that learned from one leg's latents
+    (N, m, B): in other states, on another leg, and on the agents of the other robot that have its
+    own slots, whatever they move there. A guess is right in a third, but three clusters that lie by
+    chance may be in none or all: an untrained student's say what is learned."""
     from sklearn.linear_model import LogisticRegression
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
@@ -51,10 +52,11 @@ def recognition(walker, hopper):
             ("walker's right leg, then its left", right, left)):
         classifier = make_pipeline(StandardScaler(), LogisticRegression(max_iter=1000))
         classifier.fit(*look.points_of(z[own, :, :half]))
-        found[name] = {of: float(classifier.score(*look.points_of(points[joints])))
-                       for of, points, joints in (("itself", z[:, :, half:], own),
-                                                  ("other leg", other, theirs),
-                                                  ("same slots there", other[:, :, half:], own))}
+        tried = {"itself": z[own, :, half:], "other leg": other[theirs]}
+        if other is not z:
+            tried["same slots there"] = other[own]
+        found[name] = {of: float(classifier.score(*look.points_of(points)))
+                       for of, points in tried.items()}
     return found
 
 
@@ -75,29 +77,33 @@ def draw_latents(path, panels):
 
 
 def compare(latents_of, tasks, points, seed, picture=None):
-    """Silhouettes in the `comparisons` of some tasks, and `recognition`; a picture by t-SNE, if
-    there is a path for it. latents_of(task, states): (N, m, B) in so many states, of which
-    silhouettes and picture take `points`."""
+    """Silhouettes in the `comparisons` of some tasks, of walker and hopper by hip, knee and ankle,
+    and `recognition`; a picture by t-SNE, if there is a path for it. latents_of(task, states):
+    (N, m, B) in so many states, of which silhouettes and picture take `points`."""
     found, panels = {}, {}
     for name, chosen in comparisons(tasks).items():
         latents = {task: latents_of(task, points) for task in chosen}
-        found[name] = silhouettes(latents, fac.stream(seed, "shuffled joints"))
-        if name == BETWEEN:
-            found["recognition"] = recognition(*(latents_of(task, 1000) for task in chosen))
         if picture:
             x, *labels = stacked(latents)
             panels[name] = (look.t_sne(x), *labels)
+        if name == BETWEEN:
+            walker, hopper = chosen
+            latents = {walker: latents[walker][:3], hopper: latents[hopper][1:]}
+            found["recognition"] = recognition(*(latents_of(task, 1000) for task in chosen))
+        found[name] = silhouettes(latents, fac.stream(seed, "shuffled joints"))
     if panels:
         draw_latents(picture, panels)
     return found
 
 
 def print_tables(found):
-    """Tables of what `compare` found."""
-    groups = {name: of for name, of in found.items() if name != "recognition"}
-    for rows in (groups, found.get("recognition")):
+    """Tables of what `compare` found, of students {name: it}."""
+    for title, of in (("silhouette by", lambda x: {k: v for k, v in x.items() if k in (
+            WITHIN, BETWEEN)}), ("accuracy", lambda x: x.get("recognition", {}))):
+        rows = [(f"{name}, {student}", about) for student, x in found.items()
+                for name, about in of(x).items()]
         if rows:
-            heads = [*next(iter(rows.values()))]
-            title = "silhouette by" if rows is groups else "accuracy, chance 0.33"
+            heads = [*rows[0][1]]
             fac.print_table([(title, *heads), *(
-                (name, *(f"{of[head]:.2f}" for head in heads)) for name, of in rows.items())])
+                (name, *(f"{about[head]:.2f}" if head in about else "-" for head in heads))
+                for name, about in rows)])

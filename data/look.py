@@ -1,4 +1,5 @@
 """Section 5.6: look into a model: `experiments.py watch`, `figure9` and `agreement` are here."""
+import copy
 import functools
 import os
 import subprocess
@@ -153,16 +154,27 @@ def points_of(z):
     return z.swapaxes(1, 2).reshape(-1, z.shape[1]), np.repeat(np.arange(len(z)), z.shape[2])
 
 
-def clusters(z, rng, points):
-    """Latents (N, m, B) of some states as points: t-SNE and PCA, (n, 2) each, their joints (n,),
-    and the silhouette by joint and by shuffled joints."""
+def untrained(student, seed):
+    """A student whose encoder is as its distillation began: agents have a part each of any
+    encoder's output, which may cluster before it learned anything."""
+    fresh = fac.WorldModel.create(student.config, fac.stream(seed, "student")).params
+    found = copy.copy(student)
+    found.params = {**student.params, **{
+        key: value for key, value in fresh.items() if key.startswith("_encoder.")}}
+    return found
+
+
+def clusters(z, before, rng):
+    """Latents (N, m, B) as points: t-SNE and PCA, (n, 2) each, their joints (n,), and silhouettes
+    by joint, by shuffled joints, and by joint of an untrained student's latents, `before`."""
     from sklearn.decomposition import PCA
     from sklearn.metrics import silhouette_score
-    x, joints = points_of(z[:, :, rng.choice(z.shape[2], min(points, z.shape[2]), replace=False)])
+    (x, joints), (fresh, _) = points_of(z), points_of(before)
     flat = t_sne(x), PCA(2).fit_transform(x)
     one = len(z) == 1  # no other joints to be apart from
-    return *flat, joints, *(None if one else float(silhouette_score(x, labels))
-                            for labels in (joints, rng.permutation(joints)))
+    return *flat, joints, *(None if one else float(silhouette_score(points, labels)) for
+                            points, labels in ((x, joints), (x, rng.permutation(joints)),
+                                               (fresh, joints)))
 
 
 def credit(model, obs, actions, config):
@@ -217,8 +229,11 @@ def command_figure9(args):
     seeds = fac.episode_seeds(args.seed, args.episodes)
     obs, actions, rewards, _ = fac.play(model, task, config, seeds)
     returns, rng = rewards.sum(1), np.random.default_rng(0)
-    z = model.encode(np.ascontiguousarray(obs.reshape(-1, obs.shape[2]).T))
-    tsne, pca, joints, apart, shuffled = clusters(z, rng, args.points)
+    states = obs.reshape(-1, obs.shape[2])
+    chosen = rng.choice(len(states), min(args.points, len(states)), replace=False)
+    z, before = (of.encode(np.ascontiguousarray(states[chosen].T)) for of in (
+        model, untrained(model, fac.count(header.get("seed", 0), f"{args.model}: header: seed"))))
+    tsne, pca, joints, apart, shuffled, first = clusters(z, before, rng)
     figure, grid = plt.subplots(3, 3, figsize=(11, 9), layout="constrained")
     for ax, points, name in ((grid[0, 0], tsne, "t-SNE"), (grid[0, 1], pca, "PCA")):
         for i in range(len(z)):
@@ -226,7 +241,8 @@ def command_figure9(args):
         ax.set(title=f"latents, {name}", xticks=[], yticks=[])
     grid[0, 2].axis("off")
     title = "black: the sum" if apart is None else (
-        f"black: the sum\nsilhouette by agent {apart:.2f}\nagents shuffled {shuffled:.2f}")
+        f"black: the sum\nsilhouette by agent {apart:.2f}\nagents shuffled {shuffled:.2f}\n"
+        f"untrained {first:.2f}")
     grid[0, 2].legend(*grid[0, 1].get_legend_handles_labels(), loc="upper left",
                       ncols=1 + len(z) // 8, title=title)
     moments = {}
@@ -251,11 +267,11 @@ def command_figure9(args):
                 ax.set_title(f"decision {t}")
     fac.drawn(fac.save_figure, args.out, figure)
     result = {"out": args.out, "task": task, "episodes": args.episodes, "silhouette": apart,
-              "silhouette_shuffled": shuffled, "return_best": float(returns.max()),
-              "return_worst": float(returns.min()), "moments": moments,
-              "seconds": round(time.time() - began, 1)}
+              "silhouette_shuffled": shuffled, "silhouette_untrained": first,
+              "return_best": float(returns.max()), "return_worst": float(returns.min()),
+              "moments": moments, "seconds": round(time.time() - began, 1)}
     if apart is not None:
-        print(f"silhouette by agent {apart:.2f}, shuffled {shuffled:.2f}")
+        print(f"silhouette by agent {apart:.2f}, shuffled {shuffled:.2f}, untrained {first:.2f}")
     print(args.out)
     return result
 

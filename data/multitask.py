@@ -78,20 +78,23 @@ def load_data(task, args, checkpoint, seed, folder):
         return expert, fac.PlannerConfig(**fac.made_for(header, path)), replay
     expert, path = checkpoint.teacher(task), Path(args.data or fac.DATA) / task / "replay.npz"
     if args.collect:
-        path = collect(expert, task, args.collect, seed, folder)
+        path = collect(checkpoint, task, args.collect, seed, folder)
     fac.need(path.exists(), f"{path}: no such file; --collect 20 has the teacher play instead")
     return expert, fac.PlannerConfig(), fac.Replay(path, fac.ACTION_REPEAT)
 
 
-def collect(expert, task, episodes, seed, folder):
-    """Path of the replay of episodes that an expert's policy plays, or has played."""
-    about = {"expert": fac.checksum(expert.params.values()), "seed": seed, "episodes": episodes,
-             "task": task, "versions": fac.software()}
-    path = folder / f"{task}-replay-{experiments.crc(about):08x}.npz"
+def collect(checkpoint, task, episodes, seed, folder):
+    """Path of the replay of episodes that a Checkpoint's policy plays, or has played, in a folder
+    that --data takes."""
+    about = {"teacher": fac.checksum([checkpoint.embedding, *checkpoint.params.values()]),
+             "names": checkpoint.names, "seed": seed, "episodes": episodes,
+             "versions": fac.software()}
+    path = folder / f"collected-{experiments.crc(about):08x}" / task / "replay.npz"
     if not path.exists():
         planning = fac.PlannerConfig(prior="policy", iterations=0)
-        import_expert.collect(expert, planning, fac.make_robot(task), episodes, seed)[0].write(
-            path, about)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        import_expert.collect(checkpoint.teacher(task), planning, fac.make_robot(task), episodes,
+                              seed)[0].write(path, {**about, "task": task})
     return path
 
 
@@ -114,21 +117,21 @@ def distil(args, config, out, seed, centralized, checkpoint=None):
     teachers, plannings, out = {}, {}, Path(out)
     played = out.parent / "played"
     start = load(args.start)[0] if args.start else None
+    settings = {"seed": seed, "centralized": centralized, "distill": vars(config),
+                "start": start and fac.checksum(start.params.values()), "order": args.tasks}
     with contextlib.ExitStack() as stack:
+        stack.enter_context(fac.locked(out))
+        same_student(out / "student.npz", settings)  # before any episode is played
         for task in args.tasks:
             expert, plannings[task], replay = load_data(task, args, checkpoint, seed, played)
             teachers[task] = stack.enter_context(contextlib.closing(fac.Distiller(
                 expert, replay, config, 1 if centralized else None, seed)))
-        settings = {"seed": seed, "centralized": centralized, "distill": vars(config), "of": {
-            task: fac.data_checksums(of.expert, of.replay) for task, of in teachers.items()},
-            "start": start and fac.checksum(start.params.values()), "order": args.tasks}
+        settings["of"] = {
+            task: fac.data_checksums(of.expert, of.replay) for task, of in teachers.items()}
         distiller = stack.enter_context(contextlib.closing(MultitaskDistiller(
             teachers, config, centralized, seed,
             {step: out / f"step-{step}.npz" for step in marked(config.steps)}, settings, start)))
-        stack.enter_context(fac.locked(out))
-        if (path := out / "student.npz").exists():
-            _, before = load(path)
-            fac.same_settings({key: before.get(key) for key in settings}, settings, path)
+        same_student(out / "student.npz", settings)
         for task, teacher in teachers.items():
             if config.expert_episodes:
                 let_play(teacher, task, plannings[task], args.workers, played)
@@ -137,14 +140,21 @@ def distil(args, config, out, seed, centralized, checkpoint=None):
               f"of {config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
         curve, seconds, _ = fac.train_student(distiller, out, settings,
                                               plannings[args.tasks[0]], args.workers)
-        save(path, distiller.student, settings)
+        save(out / "student.npz", distiller.student, settings)
         distiller.refresh()
-        ranks = {task: fac.rank_results(of, 64, plannings[task].discount)[
-            "rank_correlation_returns"] for task, of in teachers.items()}
+        ranks = {task: of.ranks(64, plannings[task].discount)[1].tolist()
+                 for task, of in teachers.items()}
     return {"tasks": args.tasks, "seed": seed, "centralized": centralized, "weights": count,
             "num_agents": agents, "steps": config.steps, "seconds": round(seconds, 1),
             "kl_reward": curve[-1][3], "kl_value": curve[-1][4], "rank_correlation_returns": ranks,
             "out": str(out)}
+
+
+def same_student(path, settings):
+    """UserError if there is a student of other settings."""
+    if path.exists():
+        _, before = load(path)
+        fac.same_settings({key: before.get(key) for key in settings}, settings, path)
 
 
 def marked(steps):
@@ -175,13 +185,20 @@ def command_distill(args):
 
 # ---------------------------------------------------------------------------------- evaluate
 
-def recorded(expert, header, path, episodes, seed, workers=0):
-    """The returns of an expert's episodes: those in its record; else measured."""
+def teacher_returns(expert, header, path, episodes, seed, workers=0):
+    """The returns of an expert's episodes: those in its record, where it has one; else measured."""
     planning = fac.PlannerConfig(**fac.made_for(header, path))
-    found, _ = fac.recorded_returns(path, expert, header["task"], planning, seed)
+    found = []
+    if "kind" in header:  # a Checkpoint's file isn't one task's
+        found, _ = fac.recorded_returns(path, expert, header["task"], planning, seed)
     return found[:episodes] if len(found) >= episodes else fac.evaluate(
         expert, header["task"], planning, episodes, seed, workers,
         "evaluating the teacher")["returns"]
+
+
+def policy_planning(header, path):
+    """The PlannerConfig by which an expert does what its policy says."""
+    return fac.PlannerConfig(**{**fac.made_for(header, path), "prior": "policy", "iterations": 0})
 
 
 def command_evaluate(args):
@@ -194,40 +211,62 @@ def command_evaluate(args):
         fac.need(task in student.dims, f"--tasks: {task}: {args.model} is of "
                  f"{', '.join(student.dims)}")
         expert, own, path = load_expert(task, args.data, checkpoint)
-        fac.need(fac.checksum(expert.params.values()) in header["of"][task], f"{path}: another "
-                 f"expert than {args.model} was distilled from; name its folder with --data, or "
-                 "its file with --teacher")
+        fac.need(fac.checksum(expert.params.values()) in (header.get("of") or {}).get(task, ()),
+                 f"{path}: another expert than {args.model} was distilled from; name its folder "
+                 "with --data, or its file with --teacher")
         planning = fac.from_args(fac.PlannerConfig, args, **{
             **fac.made_for(own, path), "horizon": config.horizon,
             **(fac.STUDENT_PLANNING if around else {})})
         found[task] = fac.evaluate(student.of_task(task, expert), task, planning, args.episodes,
                                    args.seed, args.workers, task)
-        found[task]["teacher_returns"] = recorded(expert, own, path, args.episodes, args.seed,
-                                                  args.workers)
-    rows = [[np.mean(of["returns"]), np.mean(of["teacher_returns"]), of["plan_ms_median"]]
-            for of in found.values()]
-    mean, teachers, _ = means = np.mean(rows, 0).tolist()
-    spread = [f" ± {np.std(of['returns']):.0f}" for of in found.values()]
-    kept = ["-" if (share := fac.return_kept(*row[:2])) is None else f"{share:.2f}"
-            for row in [*rows, means]]
-    fac.print_table([("task", "student", "teacher", "kept", "ms a decision"), *(
-        (task, f"{student:.0f}{std}", f"{teacher:.0f}", share, f"{ms:.1f}")
-        for task, std, share, (student, teacher, ms) in zip(
-            [*found, "mean"], [*spread, ""], kept, [*rows, means]))])
-    return {"tasks": found, "episodes": args.episodes, "seed": args.seed, "return_mean": mean,
-            "teacher_mean": teachers, "kept": fac.return_kept(mean, teachers)}
+        found[task]["teacher_returns"] = teacher_returns(expert, own, path, args.episodes,
+                                                         args.seed, args.workers)
+        found[task]["policy_returns"] = fac.evaluate(
+            expert, task, policy_planning(own, path), args.episodes, args.seed, args.workers,
+            "its policy alone")["returns"] if expert.has_policy else []
+        found[task]["kept"] = fac.return_kept(*(np.mean(found[task][key]) for key in (
+            "returns", "teacher_returns")))
+    rows = [[np.mean(of[key]) if of[key] else np.nan for key in (
+        "returns", "teacher_returns", "policy_returns", "plan_ms_median")] for of in found.values()]
+    student, teachers, policy, _ = means = np.mean(rows, 0).tolist()
+    kept = [*(of["kept"] for of in found.values()), fac.return_kept(student, teachers)]
+    spread = [*(f" ± {np.std(of['returns']):.0f}" for of in found.values()), ""]
+    fac.print_table([("task", "student", "teacher", "its policy alone", "kept", "ms a decision"), *(
+        (task, f"{row[0]:.0f}{std}", *(f"{x:.0f}" for x in row[1:3]),
+         "-" if share is None else f"{share:.2f}", f"{row[3]:.1f}")
+        for task, row, std, share in zip([*found, "mean"], [*rows, means], spread, kept))])
+    return {"tasks": found, "episodes": args.episodes, "seed": args.seed, "return_mean": student,
+            "teacher_mean": teachers, "kept": kept[-1],
+            "policy_mean": None if np.isnan(policy) else policy}
 
 
 # ----------------------------------------------------------------------------------- latents
 
-def latents_of(student, data, held_out, seed, task, states):
+def latents_of(student, header, data, task, states):
     """Latents (N, m, B) of a task's agents in states of its replay's held-out episodes."""
-    replay = fac.Replay(load_path(task, data, "replay.npz"))
-    fac.check_task(replay, task, replay.path)
-    _, rows = replay.starts(1, held_out, seed)
-    rng = fac.stream(seed, "latents of " + task)
+    path = load_path(task, data, "replay.npz")
+    config = fac.from_dict(fac.DistillConfig, header.get("distill"), "header: distill")
+    fac.need(path.exists(), f"{path}: no such file; name the folder of the student's replays with "
+             "--data (--collect left them in played/collected-*)")
+    replay = fac.Replay(path)
+    fac.need(fac.checksum([replay.observation, replay.action, replay.ends]) in
+             (header.get("of") or {}).get(task, ()), f"{path}: another replay than the student's; "
+             "name the folder of those with --data (--collect left them in played/collected-*)")
+    _, rows = replay.starts(1, config.held_out, header["seed"])
+    rng = fac.stream(header["seed"], "latents of " + task)
     obs, _ = replay.sequences(rng.permutation(rows)[:states], 1)
     return student.of_task(task).encode(obs)
+
+
+def compare_latents(student, header, data, points, picture):
+    """`latents.compare` of a student, printed, and {"untrained": the same} before it learned."""
+    seed = fac.count(header.get("seed"), "header: seed")
+    found = {name: latents.compare(functools.partial(latents_of, of, header, data), of.dims, points,
+                                   seed, drawn)
+             for name, of, drawn in (("trained", student, picture),
+                                     ("untrained", look.untrained(student, seed), None))}
+    latents.print_tables(found)
+    return {**found["trained"], "untrained": found["untrained"]}
 
 
 def command_latents(args):
@@ -237,12 +276,7 @@ def command_latents(args):
     fac.need(latents.comparisons(student.dims) and student.config.num_agents > 1, f"{args.model}: "
              "expected a factored student of two walker tasks, or of one and one of hopper, found "
              f"{student.config.num_agents} agents, {', '.join(student.dims)}")
-    config = fac.from_dict(fac.DistillConfig, header.get("distill"), f"{args.model}: distill")
-    seed = header.get("seed", 0)
-    found = latents.compare(functools.partial(
-        latents_of, student, args.data, config.held_out, seed), student.dims, args.points, seed,
-        args.out)
-    latents.print_tables(found)
+    found = compare_latents(student, header, args.data, args.points, args.out)
     print(args.out)
     return {**found, "out": args.out}
 
@@ -262,11 +296,11 @@ def play_marks(task, seed, case, settings, folder, data):
     episodes, steps = settings["episodes"], settings["steps"]
     own = fac.made_for(header, path)
     if case == TEACHER:
-        returns = recorded(expert, header, path, episodes, 0)
+        returns = teacher_returns(expert, header, path, episodes, 0)
         yield {"step": steps, **experiments.of_returns(returns, 0)}
     elif case == POLICY:
-        planning = fac.PlannerConfig(**{**own, "prior": "policy", "iterations": 0})
-        yield {"step": steps, **experiments.measure(expert, task, planning, episodes)}
+        yield {"step": steps, **experiments.measure(expert, task, policy_planning(header, path),
+                                                    episodes)}
     else:
         planning = fac.PlannerConfig(**{**own, "horizon": settings["horizon"], **(
             fac.STUDENT_PLANNING if case.endswith(AROUND) else {})})
@@ -316,12 +350,15 @@ def command_figure10(args):
     args.tasks = named(args.tasks) or small_tasks()
     config = read_config(args)
     look.need_plots(args.picture)
+    out = args.out or experiments.RESULTS / "figure10.csv"
+    fac.check_writable(out)
+    experiments.read_rows(out)  # what is wrong with it is missed before hours of work
     for seed, (case, centralized) in itertools.product(args.seeds, CASES.items()):
-        with contextlib.redirect_stdout(sys.stderr):
-            distil(args, config, student_folder(args.students, seed, case), seed, centralized)
+        distil(args, config, student_folder(args.students, seed, case), seed, centralized)
     students = {seed: load(student_folder(args.students, seed, "Fac-TDMPC") / "student.npz")
                 for seed in args.seeds}
-    made = experiments.crc(config, students[args.seeds[0]][1]["of"])
+    made = experiments.crc(config, fac.PlannerConfig(), fac.STUDENT_PLANNING, MARKS,
+                           students[args.seeds[0]][1]["of"])
     runs = figure10_runs(args, config, made)
     result = experiments.run_all(args, functools.partial(
         play_marks, folder=args.students, data=args.data), runs)
@@ -335,11 +372,10 @@ def command_figure10(args):
         "gradient step")
     print_figure10(found, ranks, marked(config.steps))
     compared, picture = {}, Path(args.picture).with_name(f"{Path(args.picture).stem}-latents.png")
-    for seed, (student, _) in students.items():
-        compared[seed] = latents.compare(functools.partial(
-            latents_of, student, args.data, config.held_out, seed), student.dims, 100, seed,
-            None if compared else picture)
-        latents.print_tables(compared[seed])
+    for seed, (student, header) in students.items():
+        print(f"latents, seed {seed}")
+        compared[seed] = compare_latents(student, header, args.data, 100,
+                                         None if compared else picture)
     return {**result, "returns": found, "ranks": ranks, "latents": compared,
             "picture": args.picture}
 
@@ -373,7 +409,8 @@ def make_parser():
             sub.add_argument("--tasks", nargs="+", default=[], metavar="TASK", help="any of: "
                              f"{fac.TASK_NAMES} [{tasks}]")
             sub.add_argument("--workers", type=fac.natural,
-                             help="processes that play episodes; 0: this one [cores]")
+                             help="processes that play episodes, but for --collect's; 0: this "
+                             "one [cores]")
         if model:
             sub.add_argument("--model", required=True, help="distill's student.npz or step-N.npz")
         else:
@@ -404,7 +441,8 @@ def make_parser():
     option("--collect", type=functools.partial(fac.natural, least=2), metavar="N", help="episodes "
            "of each task that --teacher's policy plays as replay [those in --data]")
     option = add("evaluate", command_evaluate, "Plan with a student in each of its tasks, by "
-                 "default around its teacher's policy; with --prior none it plans alone.",
+                 "default around its teacher's policy (defaults below are of that search); with "
+                 "--prior none it plans alone.",
                  "the student's", True)
     option("--seed", type=fac.natural, default=0, help="of the episodes [0]")
     option("--episodes", type=positive, default=20, help="of each task [20]")

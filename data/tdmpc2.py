@@ -189,6 +189,8 @@ class Checkpoint:
             need(len(self.names) == tasks, f"{EMBEDDING}: of {tasks} tasks, for which there are "
                  f"{len(self.names)} names; give --teacher-tasks all, in its order, - for others")
             self.known = [name for name in self.names if name != "-"]
+            need(self.known and len({*self.known}) == len(self.known), "--teacher-tasks: expected "
+                 f"names, each once, - for others, found {' '.join(self.names)}")
             for key, value in state.items():
                 need(key in expected or not import_expert.is_weight(value) or
                      key.startswith(BESIDE), f"{import_expert.short(key)}: unknown; {ELSEWHERE}")

@@ -1301,11 +1301,12 @@ def test_watch_refuses(tmp_path, flags, parts):
 def test_clusters_tell_joints_apart_where_they_are():
     pytest.importorskip("sklearn")
     rng = np.random.default_rng(0)
-    z = rng.standard_normal((3, 5, 40)) + 8 * np.arange(3)[:, None, None]
-    tsne, pca, joints, apart, shuffled = look.clusters(z, rng, 30)
+    before = rng.standard_normal((3, 5, 30))
+    z = before + 8 * np.arange(3)[:, None, None]
+    tsne, pca, joints, apart, shuffled, first = look.clusters(z, before, rng)
     assert tsne.shape == pca.shape == (90, 2) and joints.tolist() == [0] * 30 + [1] * 30 + [2] * 30
-    assert apart > 0.5 > 0.1 > abs(shuffled)
-    assert look.clusters(z[:1], rng, 30)[3:] == (None, None)  # one agent
+    assert apart > 0.5 > 0.1 > max(abs(shuffled), abs(first))
+    assert look.clusters(z[:1], before[:1], rng)[3:] == (None, None, None)  # one agent
 
 
 def test_credit_is_equation_2_of_what_was_executed():
@@ -1365,9 +1366,16 @@ def test_figure9_and_agreement_draw_a_model(tmp_path):
     write_expert(tmp_path / "expert.npz")
     student = random_model()
     fac.save_model(tmp_path / "student.npz", student, {"kind": "student", "task": "reacher-hard"})
+    before = look.untrained(student, 3)  # as distillation begins
+    _, fresh = fac.new_student(student.expert, student.config, 3) if student.expert else (
+        0, fac.WorldModel.create(student.config, fac.stream(3, "student")))
+    for key, value in before.params.items():
+        own = fresh if key.startswith("_encoder.") else student
+        assert np.array_equal(value, own.params[key]), key
     found = last_json(run("figure9", "--model", "student.npz", "--episodes", "2", "--points", "20",
                           "--json", cwd=tmp_path))
     assert found["silhouette"] is not None and set(found["moments"]) == {"best", "worst"}
+    assert found["silhouette_untrained"] not in (None, found["silhouette"])
     assert (tmp_path / "figure9.png").read_bytes()[:4] == b"\x89PNG"
     sizes = fac.ModelConfig(*fac.lookup_task("finger-spin")[2:], 2, 4, 8, 8)  # none of the 11
     spin = fac.WorldModel.create(sizes, np.random.default_rng(0))

@@ -204,6 +204,12 @@ def test_a_student_may_begin_from_one_of_other_tasks(data):
     with distiller_of(data, ["reacher-hard"]) as narrow:
         with pytest.raises(fac.UserError, match="--start: expected a student for robots as wide"):
             MultitaskDistiller(teachers, CONFIG, start=narrow.student)
+        for _ in range(2):  # of a wider start, then of one that had a wider start
+            with contextlib.closing(MultitaskDistiller(narrow.teachers, CONFIG,
+                                                       start=start)) as begun:
+                assert begun.student.config == start.config and [*begun.dims] == ["reacher-hard"]
+                assert np.isfinite(begun.step()[0])
+                start = begun.student
 
 
 # the program --------------------------------------------------------------------------
@@ -281,10 +287,15 @@ def test_evaluate(data, student, short_episodes):
     found = around["tasks"]["walker-walk"]
     assert alone["tasks"]["walker-walk"]["returns"] != found["returns"]
     assert alone["tasks"]["walker-walk"]["teacher_returns"] == found["teacher_returns"]
-    for name, key in (("return_mean", "returns"), ("teacher_mean", "teacher_returns")):
+    for name, key in (("return_mean", "returns"), ("teacher_mean", "teacher_returns"),
+                      ("policy_mean", "policy_returns")):
         assert np.isclose(around[name], np.mean([of[key] for of in around["tasks"].values()]))
     model, _ = load(student[0] / "two" / "student.npz")
     expert, header, path = multitask.load_expert("walker-walk", data)
+    assert found["policy_returns"] == fac.evaluate(expert, "walker-walk", fac.PlannerConfig(
+        prior="policy", iterations=0), 2, 0, 0)["returns"]
+    assert found["kept"] == fac.return_kept(np.mean(found["returns"]),
+                                            np.mean(found["teacher_returns"]))
     for prior, returns in (("policy", found), ("none", alone["tasks"]["walker-walk"])):
         planning = fac.PlannerConfig(horizon=1, **(fac.STUDENT_PLANNING if prior == "policy"
                                                    else {}))
@@ -386,6 +397,36 @@ def synthetic(parts, rng, spread=0.1):
     """Latents (N, 8, 200) of agents around a place of their own for each of `parts`."""
     places = np.random.default_rng(0).standard_normal((9, 8, 1))
     return np.stack([places[part] + spread * rng.standard_normal((8, 200)) for part in parts])
+
+
+def test_latents_are_of_the_student_s_own_replays(capsys, data, tmp_path):
+    pytest.importorskip("sklearn")
+    pytest.importorskip("matplotlib")
+    flags = ["distill", "--tasks", "walker-walk,hopper-hop", "--data", data, "--steps", "4", *TINY]
+    assert multitask.main([*map(str, flags), "--out", str(tmp_path / "run")]) == 0
+    latents_in = ["latents", "--model", tmp_path / "run" / "student.npz", "--out",
+                  tmp_path / "x.png", "--points", "20", "--data"]
+    found = said(*latents_in, data)
+    shown = found["untrained"][latents.BETWEEN]
+    assert set(shown) == set(found[latents.BETWEEN]) and shown != found[latents.BETWEEN]
+    assert set(found["untrained"]["recognition"]) == set(found["recognition"])
+    write_replay(tmp_path / "other" / "walker-walk" / "replay.npz", (24, 6), 7)
+    capsys.readouterr()
+    refused_here(capsys, [*latents_in, tmp_path / "other"], "walker-walk", "another replay")
+    refused_here(capsys, [*latents_in, tmp_path], "walker-walk", "no such file", "--data")
+
+
+@pytest.mark.parametrize("hopper, joint", [((6, 0, 1, 2), 1), ((0, 1, 2, 6), 0)])
+def test_between_robots_it_is_joints_and_not_slots_that_are_compared(hopper, joint):
+    """Latents of hip, knee and ankle alike, or of the agents with the same numbers."""
+    pytest.importorskip("sklearn")
+    of = {"walker-walk": (0, 1, 2, 0, 1, 2), "hopper-hop": hopper}
+
+    def latents_of(task, states):
+        return synthetic(of[task], np.random.default_rng(len(task)))[:, :, :states]
+
+    found = latents.compare(latents_of, of, 50, 0)[latents.BETWEEN]
+    assert (found["joint"] > 0.8) == joint and (found["task within a joint"] > 0.8) != joint
 
 
 def test_silhouettes_tell_joints_from_tasks():

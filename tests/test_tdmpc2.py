@@ -248,8 +248,8 @@ def test_the_command_has_a_teacher_play_and_a_student_distilled(tmp_path, capsys
     assert multitask.main(flags) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert result["tasks"] == ["walker-walk", "hopper-hop", "reacher-hard"]
-    assert len([*tmp_path.glob("runs/played/*-replay-*.npz")]) == 3
-    replay = fac.Replay(next(tmp_path.glob("runs/played/hopper-hop-replay-*.npz")))
+    assert len([*tmp_path.glob("runs/played/collected-*/*/replay.npz")]) == 3
+    replay = fac.Replay(next(tmp_path.glob("runs/played/*/hopper-hop/replay.npz")))
     assert (len(replay.ends), replay.transitions) == (3, 3 * 19)
     monkeypatch.setattr(import_expert, "collect", None)  # nothing is played again
     assert multitask.main([*flags[:-2], "runs/b", "--json"]) == 0
@@ -315,6 +315,8 @@ def test_what_does_not_fit_is_one_line(tmp_path, change, parts):
 def test_names_that_do_not_fit_the_model_are_refused(tmp_path, monkeypatch):
     path = write(tmp_path / "model.npz", make_state())
     refusal(lambda: tdmpc2.Checkpoint(path), "4 tasks", "0 names", "--teacher-tasks")
+    for names in (["-"] * 4, [TASK, TASK, "-", "-"]):
+        refusal(lambda names=names: tdmpc2.Checkpoint(path, names), "--teacher-tasks", "each once")
     refusal(lambda: tdmpc2.Checkpoint(path, NAMES).teacher("walker-run"), "not walker-run",
             "walker-walk, hopper-hop, reacher-hard")
     refusal(lambda: tdmpc2.Checkpoint(path, NAMES[::-1]).teacher("walker-walk"), "task 3",
