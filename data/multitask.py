@@ -353,6 +353,9 @@ def command_figure10(args):
     out = args.out or experiments.RESULTS / "figure10.csv"
     fac.check_writable(out)
     experiments.read_rows(out)  # what is wrong with it is missed before hours of work
+    for expert, _, path in (load_expert(task, args.data) for task in args.tasks):
+        fac.need(expert.has_policy, f"{path}: has no policy for students to plan around; name "
+                 "other --tasks")
     for seed, (case, centralized) in itertools.product(args.seeds, CASES.items()):
         distil(args, config, student_folder(args.students, seed, case), seed, centralized)
     students = {seed: load(student_folder(args.students, seed, "Fac-TDMPC") / "student.npz")

@@ -371,6 +371,25 @@ def test_bad_input_is_one_line(capsys, data, student, flags, parts):
     refused_here(capsys, [flag.format(**values) for flag in flags], *parts)
 
 
+def test_figure_10_refuses_before_it_distils(capsys, data, tmp_path):
+    pytest.importorskip("sklearn")
+    pytest.importorskip("matplotlib")
+    flags = ["figure10", "--tasks", "walker-walk", "--data", data, "--students", tmp_path / "own",
+             "--picture", tmp_path / "x.png", "--out"]
+    (tmp_path / "rows.csv").write_text("task,other\n")
+    refused_here(capsys, [*flags, tmp_path / "rows.csv"], "rows.csv", "expected the columns")
+    refused_here(capsys, [*flags, tmp_path / "rows.csv" / "x.csv"], "can't be written")
+    folder = tmp_path / "data" / "walker-walk"
+    expert, header = fac.load_model(data / "walker-walk" / "expert.npz")
+    for key in [key for key in expert.params if key.startswith("_pi")]:
+        expert.params.pop(key)
+    folder.mkdir(parents=True)
+    fac.save_model(folder / "expert.npz", expert, header)
+    flags[flags.index(data)] = tmp_path / "data"
+    refused_here(capsys, [*flags, tmp_path / "new.csv"], "expert.npz", "no policy", "--tasks")
+    assert not (tmp_path / "own").exists()
+
+
 def test_another_expert_than_the_student_s_is_refused(capsys, tmp_path, student):
     write_expert(tmp_path / "walker-walk" / "expert.npz", "walker-walk", (24, 6), seed=5)
     refused_here(capsys, ["evaluate", "--model", student[0] / "two" / "student.npz", "--data",
