@@ -246,12 +246,11 @@ def latents_of(student, header, data, task, states):
     """Latents (N, m, B) of a task's agents in states of its replay's held-out episodes."""
     path = load_path(task, data, "replay.npz")
     config = fac.from_dict(fac.DistillConfig, header.get("distill"), "header: distill")
-    fac.need(path.exists(), f"{path}: no such file; name the folder of the student's replays with "
-             "--data (--collect left them in played/collected-*)")
+    own = "name the folder of the student's with --data (--collect's: played/collected-*)"
+    fac.need(path.exists(), f"{path}: no such file; {own}")
     replay = fac.Replay(path)
     fac.need(fac.checksum([replay.observation, replay.action, replay.ends]) in
-             (header.get("of") or {}).get(task, ()), f"{path}: another replay than the student's; "
-             "name the folder of those with --data (--collect left them in played/collected-*)")
+             (header.get("of") or {}).get(task, ()), f"{path}: another replay; {own}")
     _, rows = replay.starts(1, config.held_out, header["seed"])
     rng = fac.stream(header["seed"], "latents of " + task)
     obs, _ = replay.sequences(rng.permutation(rows)[:states], 1)
