@@ -878,15 +878,20 @@ def make_parser():
                                  f"[{fac.STUDENT_PLANNING[name]}]")
         return sub
 
+    def add_cases(name, cases, help, tasks):
+        sub = add_runs(name, lambda args: distil_all(args, lambda _: [
+            (case, cases[case]) for case in args.cases]), help, tasks, **curve)
+        sub.add_argument("--cases", nargs="+", default=[*cases], choices=[*cases], metavar="CASE",
+                         help=f"any of: {', '.join(cases).replace('%', '%%')} [all]")
+
     walkers = ["walker-walk", "walker-run"]
     curve = {"steps": 5000, "evaluations": 4, "episodes": 5}
     shipped = [task for task in sorted(fac.TASKS) if (fac.DATA / task / "expert.npz").exists()]
-    add_runs("figure4", lambda args: distil_all(args, lambda _: FIGURE4.items()),
-             "Section 5.2: Fac-TDMPC, TD-MPC in Table 2's size and the small one of B.2, and TAP, "
-             "by Algorithm 1; return against steps.", shipped, **curve)
-    add_runs("figure5", lambda args: distil_all(args, lambda _: FIGURE5_CASES.items()),
-             "Section 5.3: KL against MSE (and without credit), the perturbations' deviation "
-             "(clipped), the student's temperature, a consistency loss.", walkers, **curve)
+    add_cases("figure4", FIGURE4, "Section 5.2: Fac-TDMPC, TD-MPC in Table 2's size and the small "
+              "one of B.2, and TAP, by Algorithm 1; return against steps.", shipped)
+    add_cases("figure5", FIGURE5_CASES, "Section 5.3: KL against MSE (and without credit), the "
+              "perturbations' deviation (clipped), the student's temperature, a consistency loss.",
+              walkers)
     add_runs("departures", command_departures, "The differences in distillation one at a time, "
              "towards the paper's values.", ["reacher-hard", "walker-walk"],
              steps=5000, evaluations=1, episodes=10)
