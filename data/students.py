@@ -71,12 +71,13 @@ def kept(rows, key="returns"):
 
 
 def wins(rows, key="returns", over="policy_returns"):
-    """What returns are above others in the same episodes: mean ± standard error over episodes, of
-    means over seeds. rows: {evaluation seed: rows by seed}"""
+    """What returns are above others in the same episodes: mean ± standard error over episodes and
+    over students, as if these were apart. rows: {evaluation seed: rows by seed}"""
     found = np.concatenate([
-        np.mean([np.subtract(returns(row, key), returns(row, over)) for row in rows[seed]], 0)
-        for seed in EVALUATION_SEEDS])
-    return f"{found.mean():.0f} ± {found.std(ddof=1) / len(found) ** 0.5:.0f}"
+        [np.subtract(returns(row, key), returns(row, over)) for row in rows[seed]]
+        for seed in EVALUATION_SEEDS], 1)  # (students, episodes)
+    errors = [x.std(ddof=1) / len(x) ** 0.5 for x in (found.mean(0), found.mean(1)) if len(x) > 1]
+    return f"{found.mean():.0f} ± {np.hypot.reduce(errors):.0f}"
 
 
 def measured(rows, of):

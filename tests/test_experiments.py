@@ -1069,8 +1069,9 @@ def test_the_table_of_students_has_a_line_for_each_preset_and_each_chosen_budget
     assert short == {**{head: own[head] for head in alike}, "task": "walker-run", "N": "6",
                      "expert": "125", "its policy alone": "100", "student": "100",
                      "`--preset plain` keeps": "-"}
-    # over both evaluation seeds: 100, 75, 125, 100; students of each episode less 210 and 20
-    assert [*search.values()] == ["walker-run", "125", "100", "115", "100", "-15 ± 14", "9.0",
+    # over both evaluation seeds: 100, 75, 125, 100; students of each episode less 210 and 20: of
+    # both students -50, -5, 15, -20, a standard error of 13.7; of each -2.5, -27.5, one of 12.5
+    assert [*search.values()] == ["walker-run", "125", "100", "115", "100", "-15 ± 19", "9.0",
                                   "1.0", "5.0", "2.0"]
     assert (own["task"], own["N"], own["MPPI"]) == ("walker-run", "6", "32 x 3")
     assert own["expert"] == "125 ± 75" and own["its policy alone"] == "100 ± 10"  # over episodes
@@ -1080,8 +1081,9 @@ def test_the_table_of_students_has_a_line_for_each_preset_and_each_chosen_budget
     assert (own["seeds"], own["minutes"]) == ("2", "6")
     assert own["kept, evaluation seeds 0 / 1"] == "0.70 / 0.90"
     assert own["least kept"] == "0.60"  # of each seed's two: 0.80, 0.60; 1.00, 0.80
-    # 110, -60 twice; each episode's mean over the two seeds: 70, -95, 135, -110
-    assert own["planning wins, expert / student"] == "25 ± 49 / 0 ± 61"
+    # 110, -60 twice; each episode's mean over the two seeds: 70, -95, 135, -110, an error of 60.7;
+    # each seed's over the episodes: 12.5, -12.5, one of 12.5
+    assert own["planning wins, expert / student"] == "25 ± 49 / 0 ± 62"
     assert own["rank correlation of G, H = 0 / last"] == "0.90 / 0.50"
     assert own["authors' logs: 100% TD-MPC / Fac-TDMPC"] == "836 / 809"
     assert (paper["task"], paper["seeds"], paper["MPPI"]) == ("walker-run, paper", "1", "512 x 6")
