@@ -341,22 +341,23 @@ def made_from(task, settings):
     return data_checksums(task)
 
 
-def command_figure13(args):
-    """figure13: the number of agents; returns first, then milliseconds, nothing else running."""
-    runs = distil_runs(args, lambda task: [(f"N = {n}", {"num_agents": n})
-                                           for n in fac.divisors(fac.lookup_task(task)[3])])
-    one_seed = [run for run in runs if run["seed"] == runs[0]["seed"]]  # others take as long
-    return time_all(args, run_all(args, distil, runs), one_seed, fresh_student)
+def distil_and_time(args, cases):
+    """As `distil_all`; then milliseconds of one seed's students, as others take as long, and not of
+    TAP's, which decode actions."""
+    runs = distil_runs(args, cases)
+    return time_all(args, run_all(args, distil, runs), [
+        run for run in runs if run["seed"] == runs[0]["seed"] and run["case"] != "TAP"],
+        fresh_student)
 
 
 def fresh_student(run, preset="default"):
     """The student of a run before it learned anything, which takes as long to plan with; header."""
     expert, header = fac.load_model(fac.data_file(run["task"], "expert.npz"))
     config = fac.DistillConfig(**fac.preset_values(fac.DistillConfig, preset))
-    agents = json.loads(run["settings"])["num_agents"]
-    sizes = fac.student_config(expert.config, agents, config.encoder_input, expert.has_policy)
-    return (fac.new_student(expert, sizes, int(run["seed"]))[1],
-            {**header, "planner": fac.student_planning(config)})
+    with contextlib.closing(distiller_of(run["case"])(
+            expert, fac.Replay(fac.data_file(run["task"], "replay.npz")), config,
+            json.loads(run["settings"]).get("num_agents"), int(run["seed"]))) as distiller:
+        return distiller.student, {**header, "planner": fac.student_planning(config)}
 
 
 def command_departures(args):
@@ -693,7 +694,7 @@ def report_curves(name, path, figures):
               for task, cases in found.items()}
     for (task, _, case, _), own in rows.items():
         for row in own:
-            if row["ms"]:  # Figure 13's, of one seed
+            if row["ms"]:  # of one seed
                 result[task][case].update({k: float(row[k]) for k in ("ms", "ms_workers")})
     cases = list(dict.fromkeys(case for found in result.values() for case in found))
     heads, table = ["", *cases, "expert"], [
@@ -878,8 +879,8 @@ def make_parser():
                                  f"[{fac.STUDENT_PLANNING[name]}]")
         return sub
 
-    def add_cases(name, cases, help, tasks):
-        sub = add_runs(name, lambda args: distil_all(args, lambda _: [
+    def add_cases(name, run, cases, help, tasks):
+        sub = add_runs(name, lambda args: run(args, lambda _: [
             (case, cases[case]) for case in args.cases]), help, tasks, **curve)
         sub.add_argument("--cases", nargs="+", default=[*cases], choices=[*cases], metavar="CASE",
                          help=f"any of: {', '.join(cases).replace('%', '%%')} [all]")
@@ -887,11 +888,12 @@ def make_parser():
     walkers = ["walker-walk", "walker-run"]
     curve = {"steps": 5000, "evaluations": 4, "episodes": 5}
     shipped = [task for task in sorted(fac.TASKS) if (fac.DATA / task / "expert.npz").exists()]
-    add_cases("figure4", FIGURE4, "Section 5.2: Fac-TDMPC, TD-MPC in Table 2's size and the small "
-              "one of B.2, and TAP, by Algorithm 1; return against steps.", shipped)
-    add_cases("figure5", FIGURE5_CASES, "Section 5.3: KL against MSE (and without credit), the "
-              "perturbations' deviation (clipped), the student's temperature, a consistency loss.",
-              walkers)
+    add_cases("figure4", distil_and_time, FIGURE4, "Section 5.2: Fac-TDMPC, TD-MPC in Table 2's "
+              "size and the small one of B.2, and TAP, by Algorithm 1; return against steps, then "
+              "milliseconds (keep the machine quiet for these).", shipped)
+    add_cases("figure5", distil_all, FIGURE5_CASES, "Section 5.3: KL against MSE (and without "
+              "credit), the perturbations' deviation (clipped), the student's temperature, a "
+              "consistency loss.", walkers)
     add_runs("departures", command_departures, "The differences in distillation one at a time, "
              "towards the paper's values.", ["reacher-hard", "walker-walk"],
              steps=5000, evaluations=1, episodes=10)
@@ -916,9 +918,11 @@ def make_parser():
                    episodes=10)
     sub.add_argument("--decisions", type=positive,
                      help="of training, a multiple of 2000 [30000; walker-walk: 48000]")
-    add_runs("figure13", command_figure13, "Appendix C.2: the number of agents.", walkers,
-             **curve)
-    for sub in (commands.choices["figure7"], commands.choices["figure13"]):
+    add_runs("figure13", lambda args: distil_and_time(args, lambda task: [
+        (f"N = {n}", {"num_agents": n}) for n in fac.divisors(fac.lookup_task(task)[3])]),
+             "Appendix C.2: the number of agents; returns, then milliseconds (keep the machine "
+             "quiet for these).", walkers, **curve)
+    for sub in map(commands.choices.get, ("figure4", "figure7", "figure13")):
         sub.add_argument("--rounds", type=positive, default=20, help="timings of each [20]")
     sub = add_runs("sweep", command_sweep, "A grid over Algorithm 1's settings and num-agents.",
                    ["reacher-hard"], steps=fac.DistillConfig.steps, evaluations=1, episodes=10)

@@ -668,6 +668,8 @@ def test_a_run_is_planned_disturbed_and_timed_as_it_says(monkeypatch, tmp_path):
     assert set(made) == {7} and row["ms"] > 0
     run = experiments.make_run("reacher-hard", 0, "N = 3", num_agents=3)
     assert experiments.fresh_student(run)[0].config.num_agents == 3
+    small = experiments.fresh_student(experiments.make_run("reacher-hard", 0, "10% TD-MPC"))[0]
+    assert (small.config.num_agents, small.config.mlp_dim) == (1, 66)
 
 
 def test_milliseconds_are_medians_over_rounds(monkeypatch):
@@ -855,7 +857,11 @@ def short_expert_episodes(monkeypatch):
                                                             np.ones((2, 500, 3))))
 
 
-def test_figure_13_distils_and_times_every_number_of_agents(tmp_path, monkeypatch):
+@pytest.mark.parametrize("command, cases, timed", [
+    (["figure13"], ["N = 1", "N = 3"], ["N = 1", "N = 3"]),
+    (["figure4", "--cases", "10% TD-MPC", "Fac-TDMPC", "TAP"], ["10% TD-MPC", "Fac-TDMPC", "TAP"],
+     ["10% TD-MPC", "Fac-TDMPC"])])
+def test_figures_4_and_13_distil_and_time_their_cases(tmp_path, monkeypatch, command, cases, timed):
     pytest.importorskip("joblib")
     monkeypatch.chdir(tmp_path)
     short_expert_episodes(monkeypatch)  # in this process
@@ -865,10 +871,10 @@ def test_figure_13_distils_and_times_every_number_of_agents(tmp_path, monkeypatc
              "--episodes", "1", "--evaluations", "1", "--samples", "4", "--iterations", "1",
              "--rounds", "2"]
     for _ in range(2):  # nothing is missing the second time
-        assert experiments.main(["figure13", *flags, "--out", "13.csv"]) == 0
-        rows = experiments.read_rows("13.csv")
-        assert [row["case"] for row in rows] == ["N = 1", "N = 3"] * 3
-        assert [bool(row["ms"]) for row in rows] == [False] * 4 + [True] * 2  # of one seed
+        assert experiments.main([*command, *flags, "--out", "rows.csv"]) == 0
+        rows = experiments.read_rows("rows.csv")
+        assert [row["case"] for row in rows] == cases * 2 + timed
+        assert [bool(row["ms"]) for row in rows] == [False] * 2 * len(cases) + [True] * len(timed)
 
 
 def write_rows(path, runs):
