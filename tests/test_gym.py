@@ -91,8 +91,8 @@ def test_no_record_speaks_for_a_robot_that_may_be_another_by_now(tmp_path, monke
                                          "--workers", "0"])
     found = fac.evaluate_both((model, config), (model, config), path, args)
     assert (found["expert_returns"], found["expert_recorded"]) == (measured, False)
-    assert multitask.recorded(model, {"task": WALK, "planner": {"samples": 2}}, path, 2, 0) == (
-        measured)
+    header = {"kind": "expert", "task": WALK, "planner": {"samples": 2}}
+    assert multitask.teacher_returns(model, header, path, 2, 0) == measured
 
 
 def test_a_gym_task_s_action_is_applied_once_unless_told_otherwise():
