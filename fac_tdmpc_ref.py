@@ -149,8 +149,7 @@ class DistillConfig(Settings):
 
 
 def student_config(theirs, num_agents, encoder_input, policy=False):
-    """A student's ModelConfig, from its expert's, whose width its agents share (at least 50 each);
-    policy: keep it, if its latent is read [D9]."""
+    """A student's ModelConfig: an Nth of its expert's width, at least 50; policy: keep it [D9]."""
     below = {} if encoder_input == "observation" else {
         "expert_latent_dim": theirs.num_agents * theirs.latent_dim,
         "expert_enc_dim": theirs.enc_dim, "expert_mlp_dim": theirs.mlp_dim if policy else 0}
@@ -666,8 +665,7 @@ class AgentPlanner:
         self.reset()
 
     def reset(self, seeds=()):
-        """Start an episode from a mean of zero; SeedSequences, one an agent, start streams, as the
-        first episode needs."""
+        """Start an episode from a mean of zero; SeedSequences, one an agent, once at least."""
         sizes = self.model.config
         self.mean = np.zeros((sizes.num_agents, self.config.horizon + 1, sizes.agent_actions), F32)
         if seeds:

@@ -219,13 +219,18 @@ def on_cluster(function, runs, client):
             yield failed(futures[future], error) if error else future.result()
 
 
+def csv_path(args):
+    """Where a command's rows go."""
+    return Path(args.out or RESULTS / f"{args.command}.csv")
+
+
 def run_all(args, function, runs):
     """function(task, seed, case, settings), rows, of all runs that the CSV doesn't hold; result."""
     with fac.optional("joblib", "experiments"):
         import joblib  # noqa: F401
     for task in args.tasks:
         fac.lookup_task(task)
-    path, errors = Path(args.out or RESULTS / f"{args.command}.csv"), []
+    path, errors = csv_path(args), []
     runs, keys = unique(runs), [*finished(read_rows(path))]
     if args.command in REPORTS:
         one_figure(path, [*(key for key in keys if key[0] in args.tasks), *map(key_of, runs)],

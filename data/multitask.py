@@ -31,6 +31,7 @@ from tdmpc2 import Checkpoint  # noqa: E402
 
 MOST_ACTIONS = 6  # of the paper's robots here
 MARKS = (0.1, 0.3, 1.0)  # shares of the steps after which Figure 10's students play
+ALONE = {"prior": "policy", "iterations": 0}  # of a PlannerConfig: what the policy says
 
 
 def named(tasks):
@@ -91,7 +92,7 @@ def collect(checkpoint, task, episodes, seed, folder):
              "versions": fac.software()}
     path = folder / f"collected-{experiments.crc(about):08x}" / task / "replay.npz"
     if not path.exists():
-        planning = fac.PlannerConfig(prior="policy", iterations=0)
+        planning = fac.PlannerConfig(**ALONE)
         path.parent.mkdir(parents=True, exist_ok=True)
         import_expert.collect(checkpoint.teacher(task), planning, fac.make_robot(task), episodes,
                               seed)[0].write(path, {**about, "task": task})
@@ -185,20 +186,15 @@ def command_distill(args):
 
 # ---------------------------------------------------------------------------------- evaluate
 
-def teacher_returns(expert, header, path, episodes, seed, workers=0):
-    """The returns of an expert's episodes: those in its record, where it has one; else measured."""
-    planning = fac.PlannerConfig(**fac.made_for(header, path))
-    found = []
+def teacher_returns(expert, header, path, episodes, seed, workers=0, **planning):
+    """The returns of an expert's episodes: those in its record, where it has one; else measured.
+    planning: settings that aren't its own."""
+    planning, found = fac.PlannerConfig(**{**fac.made_for(header, path), **planning}), []
     if "kind" in header:  # a Checkpoint's file isn't one task's
         found, _ = fac.recorded_returns(path, expert, header["task"], planning, seed)
     return found[:episodes] if len(found) >= episodes else fac.evaluate(
         expert, header["task"], planning, episodes, seed, workers,
         "evaluating the teacher")["returns"]
-
-
-def policy_planning(header, path):
-    """The PlannerConfig by which an expert does what its policy says."""
-    return fac.PlannerConfig(**{**fac.made_for(header, path), "prior": "policy", "iterations": 0})
 
 
 def command_evaluate(args):
@@ -221,9 +217,9 @@ def command_evaluate(args):
                                    args.seed, args.workers, task)
         found[task]["teacher_returns"] = teacher_returns(expert, own, path, args.episodes,
                                                          args.seed, args.workers)
-        found[task]["policy_returns"] = fac.evaluate(
-            expert, task, policy_planning(own, path), args.episodes, args.seed, args.workers,
-            "its policy alone")["returns"] if expert.has_policy else []
+        found[task]["policy_returns"] = teacher_returns(
+            expert, own, path, args.episodes, args.seed, args.workers,
+            **ALONE) if expert.has_policy else []
         found[task]["kept"] = fac.return_kept(*(np.mean(found[task][key]) for key in (
             "returns", "teacher_returns")))
     rows = [[np.mean(of[key]) if of[key] else np.nan for key in (
@@ -294,12 +290,10 @@ def play_marks(task, seed, case, settings, folder, data):
     expert, header, path = load_expert(task, data)
     episodes, steps = settings["episodes"], settings["steps"]
     own = fac.made_for(header, path)
-    if case == TEACHER:
-        returns = teacher_returns(expert, header, path, episodes, 0)
+    if case in (TEACHER, POLICY):
+        returns = teacher_returns(expert, header, path, episodes, 0,
+                                  **(ALONE if case == POLICY else {}))
         yield {"step": steps, **experiments.of_returns(returns, 0)}
-    elif case == POLICY:
-        yield {"step": steps, **experiments.measure(expert, task, policy_planning(header, path),
-                                                    episodes)}
     else:
         planning = fac.PlannerConfig(**{**own, "horizon": settings["horizon"], **(
             fac.STUDENT_PLANNING if case.endswith(AROUND) else {})})
@@ -349,8 +343,7 @@ def command_figure10(args):
     args.tasks = named(args.tasks) or small_tasks()
     config = read_config(args)
     look.need_plots(args.picture)
-    out = args.out or experiments.RESULTS / "figure10.csv"
-    fac.check_writable(out)
+    fac.check_writable(out := experiments.csv_path(args))
     experiments.read_rows(out)  # what is wrong with it is missed before hours of work
     for expert, _, path in (load_expert(task, args.data) for task in args.tasks):
         fac.need(expert.has_policy, f"{path}: has no policy for students to plan around; name "
