@@ -7,11 +7,11 @@ action dimension. Each joint then plans alone: cheaper, and in parallel.
     python fac_tdmpc_ref.py distill --task reacher-hard
     python fac_tdmpc_ref.py evaluate --model runs/reacher-hard-0/student.npz
 
-Part I is the method, with [D1] to [D5] and [D7], to be read from top to bottom: 1 settings,
-2 layers, 3 world model, 4 distillation (Equation 4, Algorithm 1), 5 planning (Equations 2 and 3).
-It runs (`distill --plain`). Part II adds [D8], [D9], settings that Part I doesn't read, speed and
-the engineering. Experts learn, by Equation 1, in data/ [D6]. The README lists the departures from
-the paper, [D1] to [D9].
+Part I is the method, to be read from top to bottom: 1 settings, 2 layers, 3 world model, 4
+distillation (Equation 4, Algorithm 1), 5 planning (Equations 2 and 3). It runs (`distill --plain`).
+Part II adds [D8], [D9] and `reuse` [D1], of which Part I has the settings only and the places where
+they come in, speed and the engineering. Experts learn, by Equation 1, in data/ [D6]. The README
+lists the departures from the paper, [D1] to [D9].
 
 The one idea that keeps it small: every model carries an agent axis N, and a centralized model is
 the case N = 1. There is one world model, one planner, one loss. The axes, everywhere:
@@ -32,7 +32,8 @@ action sequence that the expert's policy suggests to a plan. What a student comp
       -> the student's f_E -> cut into s^1, ..., s^N: (N, m, B), each repeated for K copies
     (s^i_h, a^i_h) -> f_T^i -> s^i_{h+1} for h < H: columns (L, B, K), copies side by side
                    -> f_R^i, f_Q^i -> agent i's shares of reward and value (N, L, B, K)
-    sum over i -> R_h, Q_h (L, B, K) -> softmax over K -> divergence from the expert's (Equation 4)
+    sum over i (with credit [D9] each i alone) -> R_h, Q_h (L, B, K) -> softmax over K
+                   -> divergence from the expert's (Equation 4)
 
 A layer is W (N, out, in), b (N, out, 1) and computes W @ x + b on x (N, in, B): samples last, so
 that activations run over long contiguous rows, and a torch Linear.weight goes in as weight[None].
@@ -90,18 +91,18 @@ class ModelConfig(Settings):
 
 @dataclasses.dataclass(frozen=True)
 class PlannerConfig(Settings):
-    """MPPI. Raises UserError for values that can't plan."""
+    """MPPI. A model's file may name others. Raises UserError for values that can't plan."""
     samples: int = field(128, "S: sequences drawn at once [D5]", paper=512, least=1, most=10 ** 6)
     iterations: int = field(4, "of MPPI [D5]; 0: its first mean acts", paper=6, least=0)
     prior: str = field("none", "first mean: the last plan's, or of the expert's policy [D9]",
                        repr=False, choices=("none", "policy"))
     elites: int = field(0, "best, which make the next mean; 0: samples / 8 (Table 2: 64)", least=0)
     pi_trajs: int = field(24, "P: policy proposals (Table 2)", least=0, most=10 ** 6)
-    horizon: int = field(3, "H of Equation 2; or a file's", least=0, most=EPISODE_STEPS - 1)
-    discount: float = field(0.99, "gamma (Table 2); or a file's", least=0, most=1)
+    horizon: int = field(3, "H of Equation 2", least=0, most=EPISODE_STEPS - 1)
+    discount: float = field(0.99, "gamma (Table 2)", least=0, most=1)
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)", above=0)
     max_std: float = field(2.0, "largest and first one (Table 2) [D9]", above=0)
-    inverse_temperature: float = field(0.5, "an elite weighs exp(this * G) (Table 2)", above=0)
+    inverse_temperature: float = field(0.5, "elites score exp(this * G) (TD-MPC's code)", above=0)
     momentum: float = field(0.1, "part of the old mean in the new (TD-MPC's code)", least=0, most=1)
     returns: str = field("fast", "Equation 2, plain or fast", choices=("fast", "plain"))
     output: str = field("sampled", "an elite drawn by score (TD-MPC's code), or the mean [D5]",
@@ -121,7 +122,7 @@ class DistillConfig(Settings):
     batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=2)
     noise_samples: int = field(5, "K: copies of actions, perturbed [D1]", paper=10, least=2)
     noise_std: float = field(0.3, "deviation of the noise [D9]", paper=0.5, plain=0.5, above=0)
-    targets: str = field("credit", "a share learns its agent's part (credit), or all of them "
+    targets: str = field("credit", "each share learns its agent's part, or (joint) all of them "
                          "the sum [D9]", paper="joint", plain="joint", choices=("credit", "joint"))
     policy_share: float = field(0.5, "share of states where the policy's actions are perturbed, "
                                 "not those done [D8]", paper=0.0, plain=0.0, least=0, most=1)
@@ -149,7 +150,7 @@ class DistillConfig(Settings):
 
 
 def student_config(theirs, num_agents, encoder_input, policy=False):
-    """A student's ModelConfig: an Nth of its expert's width, at least 50; policy: keep it [D9]."""
+    """A student's sizes: layers an Nth as wide as its expert's, or 50; policy: keep that [D9]."""
     below = {} if encoder_input == "observation" else {
         "expert_latent_dim": theirs.num_agents * theirs.latent_dim,
         "expert_enc_dim": theirs.enc_dim, "expert_mlp_dim": theirs.mlp_dim if policy else 0}
@@ -297,8 +298,8 @@ class Adam:
         self.m, self.v, self.t = np.zeros_like(self.vector), np.zeros_like(self.vector), 0
 
     def step(self, lr, clip=np.inf):
-        """params -= lr m_hat / (sqrt(v_hat) + eps) of the gradient, clipped to norm `clip`, which
-        is set to zero again; returns its norm."""
+        """params -= lr m_hat / (sqrt(v_hat) + eps), of the gradient clipped to norm `clip`, which
+        is then set to zero; returns its norm before."""
         length, beta1, beta2, eps = float(np.linalg.norm(self.gradient)), 0.9, 0.999, 1e-8
         if length > clip:
             self.gradient *= self.gradient.dtype.type(clip / (length + 1e-6))  # PyTorch's 1e-6
@@ -318,8 +319,8 @@ class WorldModel:
 
     `params` maps TD-MPC's state-dict names to arrays with a leading agent axis, of one dtype
     (float32; float64 to check gradients). The encoder is centralized; only experts have TD-MPC's
-    policy, `_pi`. A student keeps of its `expert`, frozen, the encoder, whose latent its own reads
-    [D3], and the policy with the dynamics that it is rolled out in, around which it plans [D9]."""
+    policy, `_pi`. A student keeps of its `expert`, frozen: the encoder, whose latent its own reads
+    [D3]; and, to plan around [D9], the policy and the dynamics to roll it out in."""
 
     def __init__(self, config, params):
         self.config, self.params, self.expert = config, params, None
@@ -512,8 +513,8 @@ def distill_loss(student, features, actions, targets, config, grads=None, diverg
 
 
 def divergences(heads, targets, config, divergence=soft_kl):
-    """What `distill_loss` returns, of `run_heads`' shares, and the loss's gradients by them: three
-    (N, L, B, K), or where targets are joint (1, L, B, K), the same for all agents."""
+    """`distill_loss`'s result from the shares of `run_heads`; and the loss's gradients by these:
+    three (N, L, B, K), or where targets are joint (1, L, B, K), the same for all agents."""
     _, L, B, K = heads[0].shape
     lam = (config.lam ** np.arange(L) / B).astype(heads[0].dtype)[:, None]
     loss, means, d_shares = 0.0, [], []
@@ -530,8 +531,8 @@ def divergences(heads, targets, config, divergence=soft_kl):
 
 
 def new_student(expert, config, seed):
-    """(Adam, student): a fresh student, and Adam on those of its weights that train; what it keeps
-    of its expert are the expert's own arrays."""
+    """(Adam, student): a student with fresh weights, and Adam on all of them but the expert's,
+    which are the expert's own arrays."""
     student = WorldModel.create(config, stream(seed, "student"))
     frozen = {k: expert.params[k[len("_expert"):]] for k in student.params
               if k.startswith("_expert")}
@@ -564,15 +565,15 @@ def perturbed_batch(expert, student, obs, actions, config, rng):
 def distill(expert, replay, config, num_agents=None, seed=0):
     """Algorithm 1: a factored student of an expert; yields it with each step's losses.
 
-    replay: the dataset, a `Replay`; `starts` are rows that H + 1 actions follow, to learn from and
-    held out, `sequences` g_0 and these. Part II's `Distiller` is this with what is left out:
-    `reuse` [D1], `expert_episodes` and `policy_share` [D8], `targets` [D9]."""
+    replay: the dataset, a `Replay`. Its `starts` are the rows that H + 1 actions follow, to learn
+    from and held out, its `sequences` the g_0 of rows and these actions. Part II's `Distiller` adds
+    `reuse` [D1], `expert_episodes`, `played_share`, `policy_share` [D8] and `targets` [D9]."""
     agents = expert.config.dim_action if num_agents is None else num_agents
     sizes = student_config(expert.config, agents, config.encoder_input)
     optimizer, student = new_student(expert, sizes, seed)
     starts, _ = replay.starts(config.horizon + 1, config.held_out, seed)
     for t in range(config.steps):                                                       # line 3
-        rng = stream(seed, f"pool {t}")  # as Part II names its own
+        rng = stream(seed, f"pool {t}")  # Part II's name: a test compares the two
         rows = rng.choice(starts, config.batch_size)
         obs, actions = replay.sequences(rows, config.horizon + 1)                       # line 4
         batch = perturbed_batch(expert, student, obs, actions[..., None], config, rng)
@@ -657,15 +658,15 @@ def policy_rollout(model, z, noise):
 
 
 class AgentPlanner:
-    """Plans for a model's agents, each of whose plans depends on its own latent, model, stream and
-    prior alone. Part II has it faster, and gives processes models of some of the agents."""
+    """Plans for each of a model's agents from its own latent, networks, random stream and prior
+    alone. Part II has it faster, and gives processes models of some of the agents."""
 
     def __init__(self, model, config):
         self.model, self.config = model, config
         self.reset()
 
     def reset(self, seeds=()):
-        """Start an episode from a mean of zero; SeedSequences, one an agent, once at least."""
+        """Start an episode: mean zero. seeds: a SeedSequence an agent, before the first plan."""
         sizes = self.model.config
         self.mean = np.zeros((sizes.num_agents, self.config.horizon + 1, sizes.agent_actions), F32)
         if seeds:
@@ -876,7 +877,7 @@ def planning_numbers(sizes, config):
 
 # ==== 7. Added to the paper: more states [D8], credit, a search around the policy [D9] =
 
-# how a student plans that was taught around its expert's policy, if its file says nothing else
+# how a student plans that was taught around its expert's policy, where no flag says otherwise
 STUDENT_PLANNING = {"prior": "policy", "max_std": 0.15, "samples": 32, "iterations": 3,
                     "output": "mean"}
 SEARCH = [f.name for f in dataclasses.fields(PlannerConfig)  # what a student's file says of it
@@ -921,8 +922,8 @@ def credit(expert, tapes, actions, predicted, sizes):
 
         part^i(y_h)_k = sum_{j <= h} (a_j^i,k - a_j^i,0) . (g_j^i,k + g_j^i,0) / 2,  g_j = dy_h/da_j
 
-    What these leave of y_h,k - y_h,0 is shared evenly. So the parts add up to the change, and the
-    one part of N = 1 teaches what joint targets do (a softmax knows no constants), but both Q one.
+    What these leave of y_h,k - y_h,0 is shared evenly, so that the parts add up to it. For N = 1
+    this is the joint target (a softmax ignores constants), but that both Q learn their mean.
 
     expert: of one agent; tapes: of `unroll` and `run_heads` for its actions (L, A, B, K), used up;
     predicted: three (L, B, K); sizes: the agents' ModelConfig. Returns the reward's parts

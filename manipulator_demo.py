@@ -1,7 +1,8 @@
 """Leaving out kinematics makes plans fast, factoring saves samples: section 4.1 on a 3-link arm.
 
 One arm moves its tip to a goal. The planner is the one that moves the robots, `fac_tdmpc_ref.mppi`;
-what differs is the model of the world that it imagines with. `python manipulator_demo.py` prints:
+what differs is the model of the world that it imagines with. Milliseconds of a plan on two busy
+cores (`python manipulator_demo.py` measures them anew):
 
                               plan ms   a transition in it
     centralized, authors' IK    42      tip (x, y): joint angles by their iteration, move, and back
@@ -9,9 +10,9 @@ what differs is the model of the world that it imagines with. `python manipulato
     joint angles, one agent      0.8    three clipped additions
     factored, three agents       0.9    one for each agent: 15 samples do what takes the other 50
 
-Axes: N agents, H actions in a row, d action dimensions and s state features of an agent, S samples
-(always last); `...` is N, goals or nothing. Angles in radians, lengths in the links' unit, equation
-numbers as in the paper. One step is 0.1 s (Table 1: freq 10).
+Axes: N agents, H actions in a row (`mppi`'s L: no Q follows), d action dimensions and s state
+features of an agent, S samples (always last); `...` is N, goals or nothing. Angles in radians,
+lengths in the links' unit, equations as the paper numbers them. A step is 0.1 s (Table 1: freq 10).
 """
 
 import argparse
@@ -159,7 +160,7 @@ class JointModel:
 # 3. Planning and moving ===============================================================
 
 # Deviations and temperature are the planner's defaults. Momentum 0: the new mean is the weighted
-# average of the elites. About the discount, which is 0.0 in Table 1, see --help.
+# average of the elites. Table 1 prints a discount of 0.0: see --help.
 TABLE_1 = fac.PlannerConfig(samples=50, iterations=6, elites=5, horizon=4, discount=1.0, momentum=0)
 
 
@@ -420,7 +421,7 @@ def _error(form, exact):
 
 
 def check_signs(rng, poses=1000):
-    """Equations 19 to 23 against 14 to 17, for random goals as the paper assumes them, beside the
+    """Equations 19, 22, 23 against 14 to 17, for random goals as the paper assumes them, beside the
     last link: (x, y) - goal = sqrt(c_e) (-sin, cos)(c1 + c2 + c3). {equation: largest relative
     error, and the share of random poses where the derivative itself is > 0}."""
     theta = rng.uniform(LOW[:, None], (LOW + SPAN)[:, None], (3, poses))
@@ -470,8 +471,8 @@ def goal_map(rng):
 
 def print_appendix(result):
     """Appendix A.1, as checked, in words."""
-    print("\nappendix A.1, at random poses: Eq. 14 to 18 against central differences, Eq. 19 to 23 "
-          "against 14\nto 17, where the paper assumes the goal to be")
+    print("\nappendix A.1, at random poses: Eq. 14 to 18 against central differences, Eq. 19, 22 "
+          "and 23\nagainst 14 to 17, where the paper assumes the goal to be")
     rows = [(key, f"{error:.0e}", "") for key, error in result["derivatives"].items()]
     rows += [(k, f"{m['error']:.0e}", f"{m['positive']:.0%}") for k, m in result["signs"].items()]
     fac.print_table([("Eq.", "relative error", "derivative > 0"), *rows])

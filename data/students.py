@@ -142,12 +142,12 @@ def table(lines, authors):
 
 
 def readme_table(lines, result):
-    """The README's: each task's default, and what its plain preset keeps. Returns are means over
-    seeds and episodes of both evaluation seeds. result: `table`'s."""
+    """The README's: the default of each of the paper's tasks, and what its plain preset keeps.
+    Returns are means over seeds and episodes of both evaluation seeds. result: `table`'s."""
     found = []
     for task, rows in lines.items():
         own = sum(rows.values(), [])
-        if task == own[0]["task"] and all(returns(row, "policy_returns") for row in own):
+        if task in fac.TASKS and all(returns(row, "policy_returns") for row in own):
             means = (overall(own, key) for key in ("expert_returns", "policy_returns", "returns"))
             found.append([task, result[task]["N"], *(f"{x:.0f}" for x in means),
                           *(result[task][head] for head in (KEPT, WINS, FASTER)),
