@@ -151,6 +151,7 @@ class DistillConfig(Settings):
 
 def student_config(theirs, num_agents, encoder_input, policy=False):
     """A student's sizes: layers an Nth as wide as its expert's, or 50; policy: keep that [D9]."""
+    num_agents = theirs.dim_action if num_agents is None else num_agents
     below = {} if encoder_input == "observation" else {
         "expert_latent_dim": theirs.num_agents * theirs.latent_dim,
         "expert_enc_dim": theirs.enc_dim, "expert_mlp_dim": theirs.mlp_dim if policy else 0}
@@ -568,8 +569,7 @@ def distill(expert, replay, config, num_agents=None, seed=0):
     replay: the dataset, a `Replay`. Its `starts` are the rows that H + 1 actions follow, to learn
     from and held out, its `sequences` the g_0 of rows and these actions. Part II's `Distiller` adds
     `reuse` [D1], `expert_episodes`, `played_share`, `policy_share` [D8] and `targets` [D9]."""
-    agents = expert.config.dim_action if num_agents is None else num_agents
-    sizes = student_config(expert.config, agents, config.encoder_input)
+    sizes = student_config(expert.config, num_agents, config.encoder_input)
     optimizer, student = new_student(expert, sizes, seed)
     starts, _ = replay.starts(config.horizon + 1, config.held_out, seed)
     for t in range(config.steps):                                                       # line 3
@@ -748,11 +748,10 @@ def count(value, name, most=10 ** 9):
     return value
 
 
-def check_finite(values, update, lr):
+def check_finite(name, value, update, lr):
     """UserError if learning diverged, before its weights are saved."""
-    for name, value in values.items():
-        need(np.isfinite(value).all(), f"after update {update} the {name} no longer finite: "
-             f"learning diverged; lower the learning rate ({lr})")
+    need(np.isfinite(value).all(), f"after update {update} the {name} no longer finite: "
+         f"learning diverged; lower the learning rate ({lr})")
 
 
 def divisors(n):
@@ -763,7 +762,7 @@ def divisors(n):
 def episode_steps(action_repeat):
     """T for this many control steps a decision; UserError if an episode doesn't divide by it."""
     need(action_repeat in divisors(CONTROL_STEPS), f"action_repeat: expected a divisor of "
-         f"{CONTROL_STEPS}, an episode's control steps, found {action_repeat!r}")
+         f"{CONTROL_STEPS}, dm_control's episode (for any robot), found {action_repeat!r}")
     return CONTROL_STEPS // action_repeat
 
 
@@ -953,15 +952,14 @@ def taught_batch(expert, student, obs, actions, config, rng):
     """`perturbed_batch` for the config's `targets`: if these are "credit", each agent's part of the
     expert's predictions, and copy 0 is what `actions` say. Perturbed actions (L, A, B, K) are in
     the order of the student's agents."""
+    perturbed, z = perturbed_actions(actions, config, rng), expert.encode(obs)
     if config.targets == "joint":
-        features, perturbed, targets = perturbed_batch(expert, student, obs, actions, config, rng)
+        targets = predict(expert, z, perturbed)
     else:
-        perturbed, z = perturbed_actions(actions, config, rng), expert.encode(obs)
         perturbed[..., :1] = actions[..., :1]
         predicted = predict(expert, z, perturbed, tapes := defaultdict(list))
         targets = credit(expert, tapes, perturbed, predicted, student.config)
-        features = student.features(obs, z)
-    return features, perturbed[:, agent_order(student.config)], targets
+    return student.features(obs, z), perturbed[:, agent_order(student.config)], targets
 
 
 # ==== 8. The same, in less time =======================================================
@@ -1039,13 +1037,12 @@ class Distiller:
              f"{theirs.num_agents} agents, credit is for one; pass --targets joint")
         self.played = np.zeros((0, replay.dim_obs + replay.dim_action), np.float16)
         self.lengths = np.zeros(0, np.int64)
-        agents = theirs.dim_action if num_agents is None else num_agents
-        if isinstance(agents, str):
-            sizes["groups"], agents = agents or ",", agents.count("/") + 1
+        if isinstance(num_agents, str):
+            sizes["groups"], num_agents = num_agents or ",", num_agents.count("/") + 1
         needed = config.steps * config.batch_size // config.reuse
         self.pool_size = max(config.batch_size, min(POOL, needed))
         shared = dataclasses.replace(theirs, dim_action=sizes.get("dim_action", theirs.dim_action))
-        sizes = dataclasses.replace(student_config(shared, agents, config.encoder_input,
+        sizes = dataclasses.replace(student_config(shared, num_agents, config.encoder_input,
                                                    expert.has_policy), **sizes)
         copies = config.noise_samples * (config.horizon + 1)  # columns of a state
         check_memory(learning_numbers(sizes, config.batch_size * copies) + copies * (
@@ -1119,7 +1116,7 @@ class Distiller:
              "set expert_episodes=0")
         while self.t < self.config.steps:
             losses = self.step()
-            check_finite({"loss is": losses}, self.t, self.config.lr)
+            check_finite("loss is", losses, self.t, self.config.lr)
             yield losses
 
     @property
@@ -1195,7 +1192,6 @@ class PlainDistiller(Distiller):
 
 # ---- How alike student and expert rank actions.
 
-
 def spearman(x, y):
     """Spearman's correlation over the last axis, where K values are ranked: (..., K) -> (...)."""
     from scipy.stats import rankdata
@@ -1255,7 +1251,6 @@ def rank_results(distiller, states, discount):
 
 
 # ---- Plans: `Returns` computes h_step_return.
-
 
 def homogeneous(params, *layers):
     """Layers of one size as matrices on inputs whose last row is 1, (N, layers, out + 1, in + 1):
@@ -1375,7 +1370,6 @@ class FastPlanner(AgentPlanner):
 
 # ---- What plans are worth, and how wide a student searches.
 
-
 def plan_gains(expert, model, config, obs, seed=0):
     """What plans of the expert or a student, `model`, are worth above what the expert's policy
     would do, in states obs (O, B): by the expert's own G, and by the model's (what they promise),
@@ -1491,8 +1485,7 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
 
     def reset(self, seed=None):
         """Start an episode: forget the last plan's mean; a seed also starts the streams anew."""
-        n = self.model.config.num_agents
-        seeds = [] if seed is None else seed_sequence(seed).spawn(n)
+        seeds = [] if seed is None else seed_sequence(seed).spawn(self.model.config.num_agents)
         self._workers.send_all(seeds[part] for part in self._parts[1:])
         self.own.reset(seeds[self._parts[0]])
 
@@ -1563,20 +1556,16 @@ class Workers(contextlib.AbstractContextManager):
             there.close()
             self._members.append((process, here))
 
-    def send(self, i, message):
-        """Send to worker i."""
-        if self._members[i][1].closed:
-            raise WorkerError(f"{self._name} {i} was stopped before; start anew")
-        try:  # plain pickle: Connection.send's own takes half of a hand-over's time
-            self._members[i][1].send_bytes(pickle.dumps(message))
-        except (BrokenPipeError, ConnectionResetError):
-            while True:  # past answers left unread, to what it ended with
-                self.receive(i)
-
     def send_all(self, messages):
         """Send one of the messages to each worker, in their order."""
-        for i, message in zip(range(len(self._members)), messages):
-            self.send(i, message)
+        for i, ((_, connection), message) in enumerate(zip(self._members, messages)):
+            if connection.closed:
+                raise WorkerError(f"{self._name} {i} was stopped before; start anew")
+            try:  # plain pickle: Connection.send's own takes half of a hand-over's time
+                connection.send_bytes(pickle.dumps(message))
+            except (BrokenPipeError, ConnectionResetError):
+                while True:  # past answers left unread, to what it ended with
+                    self.receive(i)
 
     def receive(self, i):
         """The next message of worker i; WorkerError as soon as it has died."""
@@ -1724,12 +1713,22 @@ class Environment:
         return self._observation(timestep), reward
 
 
+def ask(method, value, where):
+    """What a robot's `reset` or `step` answers; UserError: what it raised."""
+    try:
+        return method(value)
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(f"{where}: the robot raised {shown(error)}") from error
+
+
 def robot_step(robot, action, sizes, t):
     """Decision t of an episode: next observation (O,), reward, whether it is over, and whether by
     its state, beyond which nothing is worth anything: a robot's third value, if any; a fourth tells
     that the time is over. dm_control's reward of None: the next episode has begun, and all of this
     is none of ours. What goes to and fro is copied. UserError: what isn't finite."""
-    answer = robot.step(np.array(action))
+    answer = ask(robot.step, np.array(action), f"decision {t}")
     need(isinstance(answer, (tuple, list)) and 1 < len(answer) < 5 and all(
         np.asarray(end).size == 1 and end in (False, True) for end in answer[2:]), f"decision "
         f"{t}: expected (observation, reward), or also, True or False, whether the state ended "
@@ -1793,10 +1792,9 @@ def suite_sizes(task):
     return sum(int(np.prod(s.shape)) for s in spec), int(np.prod(env.action_spec().shape))
 
 
-def episode_seeds(seed, episodes, first=0):
-    """Seeds of an evaluation's episodes from `first` on: independent, whatever their number."""
-    streams = seed_sequence(seed, n_children_spawned=first).spawn(
-        count(episodes, "episodes", 10 ** 5))
+def episode_seeds(seed, episodes):
+    """Seeds of an evaluation's episodes: independent, whatever their number."""
+    streams = seed_sequence(seed).spawn(count(episodes, "episodes", 10 ** 5))
     return [int(s.generate_state(1)[0]) for s in streams]
 
 
@@ -1943,7 +1941,8 @@ def made_for(header, where):
 def check_rows(name, rows, most=None):
     """UserError names the first of rows (M, F) with a value that isn't finite, or above `most`."""
     for i, j in np.argwhere(~(np.abs(rows) <= (most or np.finfo(rows.dtype).max)))[:1]:
-        wrong = "outside [-1, 1]" if np.isfinite(rows[i, j]) else "not finite"
+        wrong = ("outside [-1, 1], which are the robot's bounds" if np.isfinite(rows[i, j]) else
+                 "not finite")
         raise UserError(f"{name}: row {i}, column {j}: {rows[i, j]} is {wrong}; drop its episode")
 
 
@@ -2029,11 +2028,15 @@ def data_file(task, name):
 def episodes_of(model, task, config, seeds, environment, noise):
     """Plan through the episode of each seed; yields its decisions, a list of observation (O,),
     action (A,), reward and seconds of planning. environment, noise: as `play`'s."""
-    environment = make_robot(task, config.action_repeat) if environment is None else environment
+    if environment is None:
+        robot = make_robot(task, config.action_repeat)
+        with contextlib.closing(robot.env):
+            yield from episodes_of(model, task, config, seeds, robot, noise)
+        return
     planner, sizes = Planner(model, config), model.config
     for seed in seeds:
         planner.reset(seed)
-        obs = checked(environment.reset(seed), (sizes.dim_obs,), "reset: observation")
+        obs = checked(ask(environment.reset, seed, "reset"), (sizes.dim_obs,), "reset: observation")
         rng, decisions = stream(seed, "exploration"), []
         deviation = F32(rng.uniform(0, noise))
         for t in range(robot_steps(environment, config)):
@@ -2165,8 +2168,8 @@ def train_student(distiller, out, settings, planning, workers):
                 continue
             means, losses = np.mean(losses, 0).tolist(), []
             q, g = (x.tolist() for x in distiller.ranks(64, planning.discount))
-            check_finite({"weights are": distiller.optimizer.vector,
-                          "student's predictions are": q}, distiller.t, config.lr)
+            check_finite("weights are", distiller.optimizer.vector, distiller.t, config.lr)
+            check_finite("student's predictions are", q, distiller.t, config.lr)
             seconds = before + time.time() - began
             curve.append([distiller.t, round(seconds, 2), *means,
                           learning_rate(config, distiller.t - 1), q[0], q[-1], g[-1]])
@@ -2247,9 +2250,8 @@ def drawn(draw, path, *what):
 
 def draw_curve(path, curve, title):
     """Losses and rank correlations over the steps."""
-    plt = pyplot()
     columns = dict(zip(CURVE, np.array(curve).T))
-    figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+    figure, axes = pyplot().subplots(1, 2, figsize=(10, 3.6), layout="constrained")
     for ax, lines in zip(axes, ({"kl_reward": "rewards", "kl_value": "values"}, {
             "rank_correlation_h0": "Q, h = 0", "rank_correlation_last": "Q, h = H",
             "rank_correlation_return": "return G"})):

@@ -22,6 +22,7 @@ import io
 import itertools
 import json
 import multiprocessing
+import operator
 import os
 import re
 import sys
@@ -46,6 +47,7 @@ from tables import (  # noqa: E402
 
 RESULTS = fac.DATA / "results"
 KEY = ("task", "seed", "case", "settings")  # what a run is; the rest is what it found
+key_of = operator.itemgetter(*KEY)  # what a run, or any of its rows, is known by
 NUMBERS = ("step", "return_mean", "return_std", "return_min", "expert_mean", "rank_q",
            "rank_return", "ms", "ms_workers", "minutes", "evaluation_seed")
 LISTS = ("returns", "expert_returns", "policy_returns", "ranks")  # JSON; returns by episode
@@ -58,11 +60,6 @@ def make_run(task, seed, case, **settings):
     settings = {k: v for k, v in settings.items() if v is not None}
     return {"task": task, "seed": str(seed), "case": case,
             "settings": json.dumps(settings, sort_keys=True)}
-
-
-def key_of(row):
-    """What a run, or any of its rows, is known by."""
-    return tuple(row[k] for k in KEY)
 
 
 def unique(runs):
@@ -556,8 +553,7 @@ def command_figure8(args):
     """figure8: every action dimension in turn disturbed, which the planner doesn't know."""
     def variants(task):
         joints = range(fac.lookup_task(task)[3])
-        return [{}, *({"joint": j, "kind": kind} for j in joints
-                      for kind in KINDS)]
+        return [{}, *({"joint": j, "kind": kind} for j in joints for kind in KINDS)]
     return run_all(args, functools.partial(plan_with, students=args.students),
                    planning_runs(args, variants))
 

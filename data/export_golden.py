@@ -25,8 +25,7 @@ except ImportError:
     torch = None  # `digest`, with which the golden files are read, doesn't need it
 
 # golden files keep to the paper in these, whatever the defaults are
-AS_PRINTED = {"horizon": 3, "lam": 0.5, "noise_std": 0.5,
-              "clip_actions": False}
+AS_PRINTED = {"horizon": 3, "lam": 0.5, "noise_std": 0.5, "clip_actions": False}
 FROZEN = "_expert"  # a student's copy of the expert's encoder
 FIRST = "student "  # prefix of weights that a file keeps
 

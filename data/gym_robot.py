@@ -9,6 +9,7 @@ fac_tdmpc_ref.make_robot makes one of these, wherever a task is played; it needs
 'fac-tdmpc-ref[gym]'`.
 """
 import warnings
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -31,6 +32,9 @@ class GymRobot:
     decisions an episode. ValueError: Gymnasium can't make it, or its spaces are others."""
 
     def __init__(self, name, action_repeat=1):
+        module = name.rpartition(":")[0]
+        if (file := Path(__file__).with_name(f"{module}.py")).exists():
+            raise ValueError(f"{file} would be imported instead; give your module another name")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that there is a newer version of the ID
             try:
@@ -48,6 +52,7 @@ class GymRobot:
             raise ValueError("actions: expected floats with finite bounds, to which [-1, 1] is "
                              "scaled; gymnasium.wrappers.RescaleAction gives some")
         self.dim_action = self._space.shape[0]
+        self.bounds = self._space.low.astype(float), self._space.high.astype(float)
         try:  # an older Gym's robots have other signatures
             self.reset(0)
             self.step(np.zeros(self.dim_action))
@@ -65,7 +70,7 @@ class GymRobot:
     def step(self, action):
         """Apply action (dim A,); returns next observation, the sum of the rewards, whether the
         state ended the episode (terminated), and whether the time did (truncated)."""
-        low, high = self._space.low.astype(float), self._space.high.astype(float)
+        low, high = self.bounds
         control = np.clip(low + (high - low) * (np.asarray(action, float) + 1) / 2, low, high)
         total, terminated, truncated = 0.0, False, False
         for _ in range(self.action_repeat):

@@ -486,11 +486,11 @@ def widened(value):
 
 # ------------------------------------------------------------------------------ the replay
 
-def find_replay(path, sizes):
+def find_replay(path, sizes, task=None):
     """What replay.npz needs, from an .npz or HDF5 file that holds it in any precision, by this
-    project's names or D4RL's."""
+    project's names or D4RL's, whose actions are within a gym: task's own bounds."""
     with reading(path, REPLAYS) as found:
-        if OWN["observation"] in found and "observation" not in found:
+        if theirs := OWN["observation"] in found and "observation" not in found:
             found = from_d4rl(found)
         for key in OWN:
             need(key in found, f"{key}: not there, only {', '.join(map(short, [*found][:9]))}")
@@ -507,11 +507,21 @@ def find_replay(path, sizes):
         need(not continues[-1], f"continues: row {rows - 1}, the last: expected False, as in every "
              "episode's last row; cut an unfinished one off, or end it there")
         action = np.where(continues[:, None], found["action"], 0)
+        if theirs and fac.is_gym(task):
+            action = np.where(continues[:, None], from_bounds(action, task), 0)
         fac.check_rows("action", action, 1.0005)  # as float16 rounds
         observation = fac.compact(found["observation"])
         fac.check_rows("observation", observation)
     return {"observation": observation, "action": fac.compact(np.clip(action, -1, 1)),
             "continues": continues}
+
+
+def from_bounds(action, task):
+    """Actions (M, A) of a gym: task's robot in [-1, 1], which stand for its bounds."""
+    robot = fac.make_robot(task)
+    robot.env.close()
+    low, high = robot.bounds
+    return 2 * (action - low) / (high - low) - 1
 
 
 def from_d4rl(found):
@@ -555,7 +565,7 @@ def run(args):
     fac.PlannerConfig(action_repeat=args.action_repeat)  # refuses what is none
     environment = args.collect and fac.make_robot(args.task, args.action_repeat)  # or misses it
     sizes, weights, kinds = find_expert(args.file, args.task)
-    arrays = args.replay and find_replay(args.replay, sizes)
+    arrays = args.replay and find_replay(args.replay, sizes, args.task)
     about = {"task": args.task, "imported_from": Path(args.file).name,
              "action_repeat": args.action_repeat}
     header = {"kind": "expert", "model": vars(sizes), **about}
@@ -563,11 +573,12 @@ def run(args):
         for source, name in ((args.file, "expert.npz"), (args.replay, "replay.npz")):
             need(not source or Path(source).resolve() != (out / name).resolve(),
                  f"{source}: would be replaced by what is made of it; choose another --out")
-        need((arrays or environment) and (out / "expert.npz").exists() or
-             not (out / "replay.npz").exists(), f"{out / 'replay.npz'}: another expert's; choose "
-             "another --out, or pass --replay or --collect beside its own expert.npz")
+        if (path := out / "replay.npz").exists():
+            need((out / "expert.npz").exists(), f"{path}: another expert's; choose another --out")
+            need(arrays or environment, f"{path}: is there from before; pass --replay or --collect "
+                 "to replace it, or choose another --out")
         need(not (out / "checkpoint.npz").exists(), f"{out / 'checkpoint.npz'}: a run of "
-             "train_expert.py, whose files would be replaced; choose another --out")
+             "train_expert.py or distill, whose files would be replaced; choose another --out")
         if (path := out / "expert.npz").exists():
             before, there = fac.read_npz(path, ("expert", "student"))
             need(before.get("task") == args.task and there.keys() == weights.keys() and all(
@@ -580,6 +591,7 @@ def run(args):
                 model, made = fac.load_model(path)
                 planning = fac.PlannerConfig(**fac.made_for(made, path))
                 buffer, returns = collect(model, planning, environment, args.collect, args.seed)
+            environment.env.close()
         fac.write_npz(out / "expert.npz", header, weights)
         result = {**about, "file": args.file, "out": args.out, "stored_as": kinds, "episodes": 0,
                   "weights": sum(w.size for w in weights.values()), "model": vars(sizes),
@@ -623,8 +635,9 @@ def main(argv=None):
     parser.add_argument("--action-repeat", type=fac.natural, metavar="N",
                         help=f"control steps of its decisions [{fac.ACTION_REPEAT}; gym:ID 1]")
     data = parser.add_mutually_exclusive_group()
-    data.add_argument("--replay", help="an .npz or HDF5 with observation, action and continues "
-                      "(README), or observations, actions, terminals, timeouts (D4RL)")
+    data.add_argument("--replay", help="an .npz or HDF5 with observation, action in [-1, 1] and "
+                      "continues (README), or observations, actions within a gym:ID's own bounds, "
+                      "terminals, timeouts (D4RL)")
     data.add_argument("--collect", type=fac.natural, metavar="N", help="have it play N episodes")
     parser.add_argument("--seed", type=fac.natural, default=0, help="of these episodes [0]")
     parser.add_argument("--json", action="store_true", help="print JSON as stdout's last line")

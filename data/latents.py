@@ -63,9 +63,8 @@ def recognition(walker, hopper):
 def draw_latents(path, panels):
     """A panel for each {name: (points (n, 2), joints (n,), tasks (n,))}: colours for joints,
     markers for tasks."""
-    plt = fac.pyplot()
-    figure, axes = plt.subplots(1, len(panels), figsize=(5.5 * len(panels), 4.8),
-                                layout="constrained", squeeze=False)
+    figure, axes = fac.pyplot().subplots(1, len(panels), figsize=(5.5 * len(panels), 4.8),
+                                         layout="constrained", squeeze=False)
     for ax, (name, (points, joints, tasks)) in zip(axes[0], panels.items()):
         for k, task in enumerate(dict.fromkeys(tasks)):
             for j in np.unique(joints[tasks == task]):

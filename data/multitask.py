@@ -125,6 +125,8 @@ def distil(args, config, out, seed, centralized, checkpoint=None):
         same_student(out / "student.npz", settings)  # before any episode is played
         for task in args.tasks:
             expert, plannings[task], replay = load_data(task, args, checkpoint, seed, played)
+            fac.need(expert.has_policy or not (config.policy_share or config.expert_episodes),
+                     f"{task}: the expert has no policy; pass --policy-share 0 --expert-episodes 0")
             teachers[task] = stack.enter_context(contextlib.closing(fac.Distiller(
                 expert, replay, config, 1 if centralized else None, seed)))
         settings["of"] = {

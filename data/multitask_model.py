@@ -124,8 +124,7 @@ def present_kl(student, expert, *settings):
 
 def padded(x, axis, length, value=0):
     """x with `value` at the end of an axis, up to a length."""
-    widths = np.zeros((x.ndim, 2), int)
-    widths[axis, 1] = length - x.shape[axis]
+    widths = [(0, length - n if i == axis else 0) for i, n in enumerate(x.shape)]
     return np.pad(x, widths, constant_values=value)
 
 
@@ -185,7 +184,7 @@ class MultitaskDistiller(fac.Distiller):
     def run(self):
         for losses in super().run():
             if self.t in self.saved:
-                fac.check_finite({"weights are": self.optimizer.vector}, self.t, self.config.lr)
+                fac.check_finite("weights are", self.optimizer.vector, self.t, self.config.lr)
                 save(self.saved[self.t], self.student, self.header)
             yield losses
 

@@ -232,9 +232,8 @@ def print_benchmark(result, robots):
 
 def draw_prediction(path, prediction, robots):
     """Figure 6: prediction times as bars, logarithmic."""
-    plt = fac.pyplot()
     subjects = list(dict.fromkeys((r["model"], r["mode"]) for r in prediction))
-    figure, axes = plt.subplots(3, 1, figsize=(10, 8), layout="constrained", sharex=True)
+    figure, axes = fac.pyplot().subplots(3, 1, figsize=(10, 8), layout="constrained", sharex=True)
     for ax, function in zip(axes, FUNCTIONS):
         for i, (model, mode) in enumerate(subjects):
             rows = [r for r in prediction if (r["function"], r["model"], r["mode"]) ==

@@ -36,8 +36,7 @@ def distil_student(task, seed, preset, settings, students):
     for evaluation_seed in reversed(EVALUATION_SEEDS):  # the first's result.json stays
         args = fac.make_parser().parse_args([
             "distill", "--task", task, "--seed", str(seed), "--preset", preset, "--workers", "0",
-            "--out", str(out), *flags,
-            "--eval-seed", str(evaluation_seed)])
+            "--out", str(out), *flags, "--eval-seed", str(evaluation_seed)])
         found = args.run(args)
         yield {"step": found["steps"], **of_returns(found["student_returns"], evaluation_seed),
                "expert_mean": found["expert_return_mean"], "rank_q": found["rank_correlation"],

@@ -52,10 +52,8 @@ def mish_backward(dy, x):
 
 def simnorm(x, group=GROUP):
     """Softmax in groups of features, (1, F, B) -> (1, F, B)."""
-    y = x.reshape(1, -1, group, x.shape[2])
-    y = np.exp(y - y.max(2, keepdims=True))
-    y /= y.sum(2, keepdims=True)
-    return y.reshape(x.shape)
+    from scipy.special import softmax
+    return softmax(x.reshape(1, -1, group, x.shape[2]), 2).reshape(x.shape)
 
 
 def simnorm_backward(dy, x, group=GROUP):

@@ -14,6 +14,7 @@ takes, student.npz, curve.csv and curve.png. A run that was cut off, by --minute
 on from its checkpoint when the same command is given again, to the same result; one that is over
 goes on with more --steps.
 """
+import contextlib
 import dataclasses
 import functools
 import sys
@@ -34,6 +35,7 @@ NOT_ONLINE = ("steps", "reuse", "expert_episodes", "held_out")
 FOLLOWING_DEFAULTS = {"expert_episodes": 0}  # the student's own instead, each round
 TORCH_ONLY = {"device": None, "precision": "float32", "threads": 1}  # and their defaults
 DECISIONS = 30_000  # in all, or the next number of whole rounds
+REACHERS = "reacher-easy", "reacher-hard"
 FINGER_RADIUS, REACHER_LINK = 0.01, 0.09  # of data/reacher.xml, metres
 LOSSES = ("consistency", "reward", "value", "kl_reward", "kl_value")
 CURVE = ("decisions", "updates", "seconds", "exploration_std", "horizon", "return_mean",
@@ -60,8 +62,8 @@ class Episode:
         self.environment, self.seed, self.player = environment, seed, player
         self.exploration_std, self.rng = exploration_std, fac.stream(seed, "exploration")
         self.hold = hold
-        self.observation = [fac.checked(environment.reset(seed), (environment.dim_obs,),
-                                        "reset: observation")]
+        self.observation = [fac.checked(fac.ask(environment.reset, seed, "reset"),
+                                        (environment.dim_obs,), "reset: observation")]
         self.action, self.reward, self.over, self.terminated = [], [], False, False
         self._warm_start = None
 
@@ -117,20 +119,23 @@ def play_on(episodes, planner, decisions):
 def _acting_worker(connection):
     """Plays its share of the episodes that `Actors` begin; players without a planner: at random."""
     robot, environments = connection.recv(), []
-    while True:
-        command, *values = connection.recv()
-        if command == "begin":
-            begun, planners = *values, {}
-            environments += [fac.make_robot(*robot) for _ in begun[len(environments):]]
-            played = [[Episode(e, *about)] for e, about in zip(environments, begun)]
-        elif command == "play":
-            decisions, newer = values
-            planners.update({name: fac.Planner(*planning) for name, planning in newer.items()})
-            for episodes in played:
-                play_on(episodes, planners.get(episodes[-1].player), decisions)
-            connection.send("played")
-        else:
-            connection.send([[e.arrays() for e in episodes] for episodes in played])
+    with contextlib.ExitStack() as stack:
+        while True:
+            command, *values = connection.recv()
+            if command == "begin":
+                begun, planners = *values, {}
+                for _ in begun[len(environments):]:
+                    environments.append(fac.make_robot(*robot))
+                    stack.callback(environments[-1].env.close)
+                played = [[Episode(e, *about)] for e, about in zip(environments, begun)]
+            elif command == "play":
+                decisions, newer = values
+                planners.update({name: fac.Planner(*planning) for name, planning in newer.items()})
+                for episodes in played:
+                    play_on(episodes, planners.get(episodes[-1].player), decisions)
+                connection.send("played")
+            else:
+                connection.send([[e.arrays() for e in episodes] for episodes in played])
 
 
 class Actors(fac.Workers):
@@ -150,10 +155,6 @@ class Actors(fac.Workers):
     def play(self, decisions, planners):
         """Let all go on, players with newer planners {player: (model, planner config)}."""
         self.send_all([("play", decisions, planners)] * self._count)
-
-    def wait(self):
-        """Until they have."""
-        self.receive_all()
 
     def episodes(self):
         """For each that was begun a list: of it and of those that followed it so far, what
@@ -334,7 +335,7 @@ def hindsight(task, buffer, where, obs, reward, rng, action_repeat=fac.ACTION_RE
     as the task draws it. where, obs, reward: as ReplayBuffer.sample gives them. Of other tasks
     nothing changes.
     """
-    if not task.startswith("reacher"):
+    if task not in REACHERS:
         return
     episode, start = where
     row = buffer.begins[episode] + rng.integers(start + 1, buffer.lengths[episode] + 1)
@@ -350,7 +351,7 @@ def spread_targets(task, observation, rng):
     Else a student would see one target an episode. The expert saw more by `hindsight`, from which
     this differs: a student reads a sequence's first state, and the actions that followed.
     """
-    if task.startswith("reacher"):
+    if task in REACHERS:
         moved = rng.random(len(observation)) < 0.5
         observation[moved, 3:5] = draw_targets(observation[moved].T.astype(np.float32), rng).T
 
@@ -459,7 +460,7 @@ class Training:
                                      self.buffer.continues(where, H))
         losses += self.student.update(self.learner.model, obs[0], actions) if self.student else [
             0.0, 0.0]
-        fac.check_finite({"losses are": losses}, updates + 1, config.lr)
+        fac.check_finite("losses are", losses, updates + 1, config.lr)
         return losses
 
     def learn_until(self, updates, bar):
@@ -487,7 +488,7 @@ class Training:
             end = min(played + self.args.refresh, self.steps)
             actors.play(end - played, {**planners, **self.explorers()})
             losses += self.learn_until(start + due * end // self.steps, bar)
-            actors.wait()
+            actors.receive_all()
             planners = {}
         episodes = actors.episodes()
         for (_, player, *_), played in zip(playing, episodes):
@@ -523,7 +524,7 @@ class Training:
         actors.begin(tests := self.tests())
         for played in range(0, self.steps, 25):  # actors notice soon if this process ends
             actors.play(25, {} if played else self.planners())
-            actors.wait()
+            actors.receive_all()
         self.note(tests, actors.episodes())
         self.seconds += time.time() - began
 
@@ -534,7 +535,7 @@ class Training:
             learned.update({**named("student", fac.optimizer_state(self.student.optimizer)),
                             **named("own", self.student.own.state())})
         for key, value in learned.items():
-            fac.check_finite({f"weights ({key}) are": value}, self.learner.updates, self.config.lr)
+            fac.check_finite(f"weights ({key}) are", value, self.learner.updates, self.config.lr)
         header = {key: getattr(self, key) for key in ("settings", "decisions", "allowed", "seconds",
                                                       "curve")}
         fac.write_npz(out / "checkpoint.npz", {"kind": "checkpoint", **header,

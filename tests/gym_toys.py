@@ -52,6 +52,15 @@ class Port(Walk):
         Port.taken = False
 
 
+class Hot(Walk):
+    """Raises in its third decision of an episode."""
+
+    def step(self, action):
+        if len(self.told) == 3:  # the first was asked as it was made
+            raise RuntimeError("motor 3 overheated")
+        return super().step(action)
+
+
 class Older(Walk):
     """Of an older Gym's signatures, or without a reward, as an option says."""
 
@@ -81,6 +90,7 @@ if "Walk-v0" not in gymnasium.registry:
     gymnasium.register("Stroll-v0", Walk, max_episode_steps=12, kwargs={"falls": False})
     gymnasium.register("Endless-v0", Walk, kwargs={"falls": False})
     gymnasium.register("Port-v0", Port, max_episode_steps=12)
+    gymnasium.register("Hot-v0", Hot, max_episode_steps=12, kwargs={"falls": False})
     for odd in ("seed", "reset", "step", "reward"):
         gymnasium.register(f"Older-{odd}-v0", Older, max_episode_steps=12, kwargs={"odd": odd})
     for name, spaces in SPACES.items():

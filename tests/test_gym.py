@@ -78,8 +78,22 @@ def test_episodes_are_as_long_as_the_robot_says_in_processes_too():
 def test_a_robot_that_only_one_process_can_hold_is_played():
     model = fac.WorldModel.create(fac.ModelConfig(3, 2, 2, 2, 4, 4), np.random.default_rng(0))
     config = fac.PlannerConfig(samples=2, iterations=1, action_repeat=1)
-    found = fac.evaluate(model, "gym:gym_toys:Port-v0", config, 2, 0, 0)
-    assert found["returns"] == [fallen(seed) for seed in fac.episode_seeds(0, 2)]
+    for _ in range(2):  # which closes it
+        found = fac.evaluate(model, "gym:gym_toys:Port-v0", config, 2, 0, 0)
+        assert found["returns"] == [fallen(seed) for seed in fac.episode_seeds(0, 2)]
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_what_a_robot_raises_is_said_in_a_line(workers):
+    model = fac.WorldModel.create(fac.ModelConfig(3, 2, 2, 2, 4, 4), np.random.default_rng(0))
+    config = fac.PlannerConfig(samples=2, iterations=1, action_repeat=1)
+    with pytest.raises(fac.UserError, match=r"^decision 2: the robot raised .*motor 3 overheated"):
+        fac.evaluate(model, "gym:gym_toys:Hot-v0", config, 1, 0, workers)
+
+
+def test_a_module_that_data_hides_is_refused():
+    with pytest.raises(fac.UserError, match="own_robot.py would be imported instead; give your"):
+        fac.make_robot("gym:own_robot:Walk-v0")
 
 
 def test_no_record_speaks_for_a_robot_that_may_be_another_by_now(tmp_path, monkeypatch):

@@ -983,6 +983,23 @@ def test_minari_episodes_become_a_replay(tmp_path):
         import_expert.find_replay(tmp_path / "other.h5", sizes)
 
 
+def test_others_actions_are_within_the_robot_s_bounds(tmp_path):
+    """Pendulum's are -2 to 2; this project's names say that they are scaled already."""
+    pytest.importorskip("gymnasium")
+    rows, sizes = 24, fac.ModelConfig(dim_obs=3, dim_action=1)
+    action, ends = np.linspace(-2, 2, rows)[:, None], np.arange(rows) % 12 == 11
+    np.savez(theirs := tmp_path / "theirs.npz", observations=np.zeros((rows, 3)), actions=action,
+             timeouts=ends)
+    np.savez(own := tmp_path / "own.npz", observation=np.zeros((rows, 3)), action=action / 2,
+             continues=~ends)
+    for path in theirs, own:
+        found = import_expert.find_replay(path, sizes, "gym:Pendulum-v1")["action"]
+        np.testing.assert_allclose(found[~ends], action[~ends] / 2, atol=1e-3)
+    np.savez(theirs, observations=np.zeros((rows, 3)), actions=action * 3, timeouts=ends)
+    with pytest.raises(fac.UserError, match="action: row 0, .* which are the robot's bounds"):
+        import_expert.find_replay(theirs, sizes, "gym:Pendulum-v1")
+
+
 def test_an_hdf5_file_holds_its_own_bytes_and_no_more_than_it_has(tmp_path):
     h5py = pytest.importorskip("h5py")
     secret = tmp_path / "secret"
@@ -1096,7 +1113,7 @@ def test_collected_episodes_distil_and_depend_on_the_seed_alone(tmp_path, capsys
     for flags, part in (([str(tmp_path / "a" / "expert.npz")], "expert.npz: would be replaced"),
                         ([str(model), "--replay", str(tmp_path / "a" / "replay.npz")],
                          "replay.npz: would be replaced"),
-                        ([str(model)], "replay.npz: another expert's; choose another --out"),
+                        ([str(model)], "replay.npz: is there from before; pass --replay or --"),
                         ([str(model), "--task", "reacher-hard", "--collect", "3"],
                          "expert.npz: another expert"),
                         ([str(fac.data_file("reacher-easy", "expert.npz")), "--collect", "3"],

@@ -336,7 +336,7 @@ def test_settings_hold_python_s_own_numbers():
 
 
 def test_one_number_that_is_not_finite_is_divergence():
-    fac.check_finite({"loss is": [1.0, 2.0], "weights are": np.ones(3)}, 5, 1e-3)
-    for values in ({"loss is": [1.0, np.nan]}, {"loss is": [1.0], "weights are": [1, -np.inf]}):
-        with pytest.raises(fac.UserError, match=f"update 5 the {[*values][-1]} no longer finite"):
-            fac.check_finite(values, 5, 1e-3)
+    fac.check_finite("loss is", [1.0, 2.0], 5, 1e-3)
+    for name, value in (("loss is", [1.0, np.nan]), ("weights are", [1, -np.inf])):
+        with pytest.raises(fac.UserError, match=f"update 5 the {name} no longer finite"):
+            fac.check_finite(name, value, 5, 1e-3)

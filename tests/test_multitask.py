@@ -5,6 +5,7 @@ import functools
 import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -388,6 +389,9 @@ def test_figure_10_refuses_before_it_distils(capsys, data, tmp_path):
     flags[flags.index(data)] = tmp_path / "data"
     refused_here(capsys, [*flags, tmp_path / "new.csv"], "expert.npz", "no policy", "--tasks")
     assert not (tmp_path / "own").exists()
+    shutil.copy(data / "walker-walk" / "replay.npz", folder)
+    refused_here(capsys, ["distill", "--tasks", "walker-walk", "--data", tmp_path / "data", "--out",
+                          tmp_path / "own"], "walker-walk: the expert has no policy; pass --policy")
 
 
 def test_another_expert_than_the_student_s_is_refused(capsys, tmp_path, student):

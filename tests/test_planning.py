@@ -498,12 +498,12 @@ def test_a_dead_worker_is_reported_behind_an_answer_that_nobody_read():
     with fac.Planner(random_model(), fac.PlannerConfig(samples=16), workers=1) as planner:
         workers, z = planner._workers, planner.model.encode(np.zeros((8, 1), np.float32))[-1:]
         process, connection = workers._members[0]
-        workers.send(0, z)
+        workers.send_all([z])
         assert connection.poll(10)
         os.kill(process.pid, signal.SIGKILL)
         process.join()
         with pytest.raises(fac.WorkerError, match="worker 0 ended with exit code -9"):
-            workers.send(0, z)
+            workers.send_all([z])
 
 
 def test_an_interrupted_decision_ends_the_workers(monkeypatch):
@@ -601,7 +601,7 @@ def refuses(connection):
 def test_a_worker_that_ends_while_it_is_sent_to_says_why():
     with fac.Workers(refuses, 1) as workers:
         with pytest.raises(fac.UserError, match="not on this machine"):
-            workers.send(0, bytes(10_000_000))  # more than a pipe holds
+            workers.send_all([bytes(10_000_000)])  # more than a pipe holds
 
 
 def wants_too_much(connection):

@@ -82,7 +82,7 @@ def test_a_replay_is_spread_over_training(tmp_path):
 def test_half_of_a_reacher_replay_s_states_get_another_target():
     rng = np.random.default_rng(0)
     before = rng.standard_normal((4000, 8)).astype(np.float16)
-    for task, share in (("walker-walk", 0), ("reacher-hard", 0.5)):
+    for task, share in (("walker-walk", 0), ("reacher-mine", 0), ("reacher-hard", 0.5)):
         after = before.copy()
         train_expert.spread_targets(task, after, rng)
         moved = (after[:, 3:5] != before[:, 3:5]).all(1)
@@ -348,7 +348,7 @@ class Still:
     def play(self, decisions, planners):
         self.played.append((decisions, self.learner.updates, set(planners)))
 
-    def wait(self):
+    def receive_all(self):
         pass
 
     def episodes(self):
@@ -602,7 +602,7 @@ def test_actors_equal_single_environments(workers, monkeypatch):
         actors.begin([(seed, "explorer", 0.5) for seed in seeds])
         for decisions in (1, 2):
             actors.play(decisions, {})
-            actors.wait()
+            actors.receive_all()
         assert sent == ["played"] * 2 * workers
         episodes = actors.episodes()
     finally:
@@ -628,9 +628,9 @@ def test_tests_beside_the_training_are_an_evaluation():
     try:
         actors.begin([(7, "explorer", 0.5), *((seed, "expert") for seed in seeds)])
         actors.play(200, {"expert": (model, planning)})
-        actors.wait()
+        actors.receive_all()
         actors.play(300, {"explorer": (model, planning)})
-        actors.wait()
+        actors.receive_all()
         returns = [reward.sum() for ((*_, reward, _),) in actors.episodes()[1:]]
     finally:
         actors.close()
