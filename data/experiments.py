@@ -804,8 +804,8 @@ def report_students(_, path, figures):
         row for own in settled(path, VARIED["students"], False).values() for row in own)
     result, text = students.table(lines, {
         task: f"{found[1]} / {found[0]}" for task, found in AUTHORS.items()})
-    return result, "\n".join([students.readme_table(lines, result), text,
-                              students.search_table(lines)])
+    short = (students.readme_table(lines, result, paper) for paper in (True, False))
+    return result, "\n".join([*short, text, students.search_table(lines)])
 
 
 REPORT_HEAD = """# The paper's figures, here

@@ -140,13 +140,15 @@ def table(lines, authors):
                             [found.values() for found in result.values()])
 
 
-def readme_table(lines, result):
-    """The README's: the default of each of the paper's tasks, and what its plain preset keeps.
-    Returns are means over seeds and episodes of both evaluation seeds. result: `table`'s."""
+def readme_table(lines, result, paper=True):
+    """The README's: the default of each of the paper's tasks, or of the others, and what its plain
+    preset keeps. Returns are means over seeds and episodes of both evaluation seeds. result:
+    `table`'s."""
     found = []
     for task, rows in lines.items():
         own = sum(rows.values(), [])
-        if task in fac.TASKS and all(returns(row, "policy_returns") for row in own):
+        if (task in fac.TASKS) == paper and task == own[0]["task"] and all(
+                returns(row, "policy_returns") for row in own):
             means = (overall(own, key) for key in ("expert_returns", "policy_returns", "returns"))
             found.append([task, result[task]["N"], *(f"{x:.0f}" for x in means),
                           *(result[task][head] for head in (KEPT, WINS, FASTER)),
