@@ -698,8 +698,7 @@ class AgentPlanner:
 
 
 # ==== Part II: additions and engineering ==============================================
-# A first reader is done: what follows is what this project adds to the paper, the same in less
-# time and in processes, and what a program needs around it.
+# A first reader is done: what follows is added to the paper, saves time, or is a program's needs.
 
 import argparse
 import contextlib
@@ -1690,6 +1689,7 @@ class Environment:
             self.env = suite.load(domain, name, task_kwargs={"random": 0})
         spec = self.env.action_spec()
         self._low, self._scale = spec.minimum, (spec.maximum - spec.minimum) / 2
+        self.close = self.env.close
 
     @staticmethod
     def _observation(timestep):
@@ -1717,10 +1717,9 @@ def ask(method, value, where):
     """What a robot's `reset` or `step` answers; UserError: what it raised."""
     try:
         return method(value)
-    except UserError:
-        raise
-    except Exception as error:
-        raise UserError(f"{where}: the robot raised {shown(error)}") from error
+    except (Exception, SystemExit) as error:
+        raise error if isinstance(error, UserError) else UserError(
+            f"{where}: the robot raised {shown(error)}") from error
 
 
 def robot_step(robot, action, sizes, t):
@@ -1766,7 +1765,7 @@ def lookup_task(task):
 def gym_sizes(task, repeat=1):
     """(dim O, dim A, T) of a task of Gymnasium's, from its robot; UserError: it can't be made."""
     robot = make_robot(task, repeat)
-    robot.env.close()  # the one that plays may need what it holds
+    robot.close()  # the one that plays may need what it holds
     return robot.dim_obs, robot.dim_action, robot.episode_steps
 
 
@@ -2029,8 +2028,7 @@ def episodes_of(model, task, config, seeds, environment, noise):
     """Plan through the episode of each seed; yields its decisions, a list of observation (O,),
     action (A,), reward and seconds of planning. environment, noise: as `play`'s."""
     if environment is None:
-        robot = make_robot(task, config.action_repeat)
-        with contextlib.closing(robot.env):
+        with contextlib.closing(make_robot(task, config.action_repeat)) as robot:
             yield from episodes_of(model, task, config, seeds, robot, noise)
         return
     planner, sizes = Planner(model, config), model.config
@@ -2154,7 +2152,8 @@ def train_student(distiller, out, settings, planning, workers):
             distiller.load(arrays)
             if distiller.t:
                 curve, before = header["curve"], float(header["seconds"])
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
+                np.array(curve, float).reshape(-1, len(CURVE))[-1]  # raises where it is none
+        except (LookupError, TypeError, ValueError, OverflowError) as error:
             raise UserError(f"{checkpoint}: damaged ({error!r}); delete it to start anew") from None
     began = saved = time.time()
     if not distiller.t and config.expert_episodes:
@@ -2212,8 +2211,9 @@ def optional(library, extra):
     """Around an import: UserError that names what to install where the library is missing."""
     try:
         yield
-    except ImportError:
-        raise UserError(f"this needs {library}: pip install 'fac-tdmpc-ref[{extra}]'") from None
+    except ImportError as error:
+        raise UserError(f"this needs {library}: pip install 'fac-tdmpc-ref[{extra}]' ({error})"
+                        ) from None
 
 
 def pyplot():
@@ -2316,10 +2316,10 @@ def command_distill(args):
     expert, header, replay, path = load_data(args)
     theirs = {**preset(PlannerConfig), **made_for(header, path)}
     own = PlannerConfig(**theirs)  # the expert's
-    around = getattr(args, "PlannerConfig.prior") != "none"
+    search = student_planning(config) if getattr(args, "PlannerConfig.prior") != "none" else {}
     planning = from_args(PlannerConfig, args, **{
-        **theirs, **(student_planning(config) if around else {}), "horizon": config.horizon,
-        **({"returns": "plain"} if args.plain else {})})
+        **theirs, **(search and {"elites": 0, "min_std": 0.05}), **search,  # not for its samples
+        "horizon": config.horizon, **({"returns": "plain"} if args.plain else {})})
     distiller_class = PlainDistiller if args.plain else Distiller
     out = Path(args.out or f"runs/{args.task}-{args.seed}")
     read_records(path)  # what is damaged is missed now

@@ -81,8 +81,8 @@ def read_rows(path):
             if len(cells) == len(ROW):  # a kill cuts one line alone
                 numbers = [float(row[key] or 0) for key in NUMBERS]
                 fac.need(np.isfinite(numbers).all() and json.loads(row["settings"]).items, "")
-                fac.need(all(isinstance(json.loads(row[key] or "[]"), (list, dict))
-                             for key in LISTS), "")
+                fac.need(all(isinstance(json.loads(row[key]), dict if key == "ranks" else list)
+                             for key in LISTS if row[key]), "")
                 rows.append(row)
         except (ValueError, TypeError, AttributeError, RecursionError, csv.Error, fac.UserError):
             raise fac.UserError(f"{path}: expected numbers from {ROW[4]} on, settings and lists as "
@@ -460,8 +460,10 @@ def planning_runs(args, variants):
         model, header = load(task, seed, case, args.students)
         if case == "expert":
             expert = fac.checksum(model.params.values())  # as its students' files name it
-        fac.need(header.get("data", [expert])[0] == expert, f"{args.students}/{task}-{seed}/student"
-                 f".npz: another expert's student than data/{task}/expert.npz; copy its own there")
+        data = header.get("data", [expert])
+        fac.need(isinstance(data, list) and data[:1] == [expert], f"{args.students}/{task}-"
+                 f"{seed}/student.npz: another expert's student than data/{task}/expert.npz; copy "
+                 "its own there")
         runs += [make_run(task, seed, case, episodes=args.episodes, **identity(model, header),
                           **variant) for variant in variants(task)]
     return runs

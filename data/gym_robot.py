@@ -8,6 +8,8 @@ gym:MODULE:ID imports MODULE, from your PYTHONPATH, which registers a robot of y
 fac_tdmpc_ref.make_robot makes one of these, wherever a task is played; it needs `pip install
 'fac-tdmpc-ref[gym]'`.
 """
+import os
+import sys
 import warnings
 from pathlib import Path
 
@@ -32,9 +34,11 @@ class GymRobot:
     decisions an episode. ValueError: Gymnasium can't make it, or its spaces are others."""
 
     def __init__(self, name, action_repeat=1):
-        module = name.rpartition(":")[0]
-        if (file := Path(__file__).with_name(f"{module}.py")).exists():
-            raise ValueError(f"{file} would be imported instead; give your module another name")
+        file = Path(__file__).with_name(f"{name.rpartition(':')[0]}.py")
+        for folder in os.environ.get("PYTHONPATH", "").split(os.pathsep):
+            if file.exists() and Path(folder, file.name).exists() and not file.samefile(
+                    Path(folder, file.name)):
+                raise ValueError(f"{file} may be imported instead; give your module another name")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that there is a newer version of the ID
             try:
@@ -46,8 +50,8 @@ class GymRobot:
             steps = MOST_STEPS
             self.env = gymnasium.wrappers.TimeLimit(self.env, steps)
         self.action_repeat, self.episode_steps = action_repeat, -(-steps // action_repeat)
-        self.dim_obs = flat(self.env.observation_space, "observations").shape[0]
-        self._space = flat(self.env.action_space, "actions")
+        self.dim_obs = flat(getattr(self.env, "observation_space", None), "observations").shape[0]
+        self._space = flat(getattr(self.env, "action_space", None), "actions")
         if not (self._space.is_bounded() and self._space.dtype.kind == "f"):
             raise ValueError("actions: expected floats with finite bounds, to which [-1, 1] is "
                              "scaled; gymnasium.wrappers.RescaleAction gives some")
@@ -80,3 +84,10 @@ class GymRobot:
             if terminated or truncated:
                 break
         return obs, total, terminated, truncated
+
+    def close(self):
+        """Let go of what the robot holds; what that raises is said, and costs nothing else."""
+        try:
+            self.env.close()
+        except Exception as error:
+            print(f"{self.env.spec.id}: close: {error!r}", file=sys.stderr)

@@ -356,7 +356,7 @@ def read_hdf5(path):
 
 
 def from_minari(episodes):
-    """Minari's episodes by name, of T + 1 observations and T actions each, as this project's."""
+    """Minari's episodes by name, of T + 1 observations and T actions each, as D4RL's arrays."""
     for name, episode in episodes.items():
         shapes = [np.shape(episode.get(key, ())) for key in ("observations", "actions")]
         need([*map(len, shapes)] == [2, 2] and shapes[0][0] == shapes[1][0] + 1 > 1,
@@ -364,11 +364,11 @@ def from_minari(episodes):
              f"{' and '.join(map(str, shapes))}")
     actions = [np.pad(np.asarray(episode["actions"]), ((0, 1), (0, 0)))
                for episode in episodes.values()]
-    continues = np.ones(sum(map(len, actions)), bool)
-    continues[np.cumsum([*map(len, actions)]) - 1] = False
-    return {"observation": np.concatenate([episode["observations"]
-                                           for episode in episodes.values()]),
-            "action": np.concatenate(actions), "continues": continues}
+    ends = np.zeros(sum(map(len, actions)), bool)
+    ends[np.cumsum([*map(len, actions)]) - 1] = True
+    return {"observations": np.concatenate([episode["observations"]
+                                            for episode in episodes.values()]),
+            "actions": np.concatenate(actions), "timeouts": ends}
 
 
 # ------------------------------------------------------------------------------ the expert
@@ -519,9 +519,9 @@ def find_replay(path, sizes, task=None):
 def from_bounds(action, task):
     """Actions (M, A) of a gym: task's robot in [-1, 1], which stand for its bounds."""
     robot = fac.make_robot(task)
-    robot.env.close()
+    robot.close()
     low, high = robot.bounds
-    return 2 * (action - low) / (high - low) - 1
+    return 2 * (action - low) / np.where(high > low, high - low, 1) - 1
 
 
 def from_d4rl(found):
@@ -553,6 +553,15 @@ def collect(model, config, environment, episodes, seed):
     return buffer, reward.sum(1).tolist()
 
 
+def own_header(path):
+    """What a file of this project's says it was made for; {} of others'."""
+    with contextlib.suppress(fac.UserError):
+        header, _ = fac.read_npz(path, ("expert",))
+        fac.made_for(header, path)
+        return {k: header[k] for k in ("training", "planner", "action_repeat") if k in header}
+    return {}
+
+
 # ---------------------------------------------------------------------------- command line
 
 def run(args):
@@ -560,15 +569,16 @@ def run(args):
     need(args.collect is None or args.collect > 1, f"--collect must be at least 2, better "
          f"{LEAST_EPISODES}: distill holds out an episode in {LEAST_EPISODES}; not {args.collect}")
     fac.lookup_task(args.task)
+    made = own_header(args.file)
     if args.action_repeat is None:
-        args.action_repeat = fac.task_repeat(args.task)
+        args.action_repeat = made.get("action_repeat", fac.task_repeat(args.task))
     fac.PlannerConfig(action_repeat=args.action_repeat)  # refuses what is none
     environment = args.collect and fac.make_robot(args.task, args.action_repeat)  # or misses it
     sizes, weights, kinds = find_expert(args.file, args.task)
     arrays = args.replay and find_replay(args.replay, sizes, args.task)
     about = {"task": args.task, "imported_from": Path(args.file).name,
              "action_repeat": args.action_repeat}
-    header = {"kind": "expert", "model": vars(sizes), **about}
+    header = {**made, "kind": "expert", "model": vars(sizes), **about}
     with fac.locked(out := Path(args.out)):
         for source, name in ((args.file, "expert.npz"), (args.replay, "replay.npz")):
             need(not source or Path(source).resolve() != (out / name).resolve(),
@@ -591,7 +601,7 @@ def run(args):
                 model, made = fac.load_model(path)
                 planning = fac.PlannerConfig(**fac.made_for(made, path))
                 buffer, returns = collect(model, planning, environment, args.collect, args.seed)
-            environment.env.close()
+            environment.close()
         fac.write_npz(out / "expert.npz", header, weights)
         result = {**about, "file": args.file, "out": args.out, "stored_as": kinds, "episodes": 0,
                   "weights": sum(w.size for w in weights.values()), "model": vars(sizes),

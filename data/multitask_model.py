@@ -101,6 +101,9 @@ def load(path):
     fac.need(isinstance(dims, dict) and dims, f"{there}: expected sizes by task, found {dims!r}")
     expected = {task: [*fac.lookup_task(task)[2:]] for task in dims}
     fac.need(dims == expected, f"{there}: expected {expected}, found {dims}")
+    of = header.get("of", {})
+    fac.need(isinstance(of, dict) and all(isinstance(sums, list) for sums in of.values()),
+             f"{path}: header: of: expected checksums by task, found {fac.shown(of)}")
     shapes = {TASKS: (1, EMBEDDING, len(dims)),
               SCALES: (1, config.dim_obs - EMBEDDING, len(dims))}
     for name, i, _, shape, _ in fac.layers(config):

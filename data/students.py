@@ -32,7 +32,8 @@ def distil_student(task, seed, preset, settings, students):
     if budget := [f"{k}-{settings[k]}" for k in ("samples", "iterations") if k in settings]:
         out = default.with_name("-".join([default.name, *budget]))  # its file names its search
         if default.exists() and not out.exists():
-            shutil.copytree(default, out)
+            shutil.copytree(default, part := out.with_name(f"{out.name}.tmp"), dirs_exist_ok=True)
+            part.rename(out)  # whole, or not there
     for evaluation_seed in reversed(EVALUATION_SEEDS):  # the first's result.json stays
         args = fac.make_parser().parse_args([
             "distill", "--task", task, "--seed", str(seed), "--preset", preset, "--workers", "0",

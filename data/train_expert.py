@@ -126,7 +126,7 @@ def _acting_worker(connection):
                 begun, planners = *values, {}
                 for _ in begun[len(environments):]:
                     environments.append(fac.make_robot(*robot))
-                    stack.callback(environments[-1].env.close)
+                    stack.callback(environments[-1].close)
                 played = [[Episode(e, *about)] for e, about in zip(environments, begun)]
             elif command == "play":
                 decisions, newer = values
@@ -558,7 +558,11 @@ class Training:
             self.buffer.load(arrays)
             for key in ("decisions", "allowed", "seconds", "curve"):
                 setattr(self, key, header[key])
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:  # the last is PyTorch's
+            if min(self.decisions, self.allowed, self.seconds) < 0 or any(
+                    row.keys() != {*CURVE} for row in self.curve):
+                raise ValueError("curve")
+        except (LookupError, TypeError, ValueError, AttributeError,
+                RuntimeError) as error:  # the last is PyTorch's
             raise fac.UserError(f"{path}: damaged ({error!r}); choose another --out, or empty it"
                                 ) from None
 

@@ -52,6 +52,13 @@ class Port(Walk):
         Port.taken = False
 
 
+class Stuck(Walk):
+    """Whose end raises."""
+
+    def close(self):
+        raise RuntimeError("motor off failed")
+
+
 class Hot(Walk):
     """Raises in its third decision of an episode."""
 
@@ -90,6 +97,7 @@ if "Walk-v0" not in gymnasium.registry:
     gymnasium.register("Stroll-v0", Walk, max_episode_steps=12, kwargs={"falls": False})
     gymnasium.register("Endless-v0", Walk, kwargs={"falls": False})
     gymnasium.register("Port-v0", Port, max_episode_steps=12)
+    gymnasium.register("Stuck-v0", Stuck, max_episode_steps=12)
     gymnasium.register("Hot-v0", Hot, max_episode_steps=12, kwargs={"falls": False})
     for odd in ("seed", "reset", "step", "reward"):
         gymnasium.register(f"Older-{odd}-v0", Older, max_episode_steps=12, kwargs={"odd": odd})

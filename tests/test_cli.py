@@ -818,9 +818,21 @@ def test_a_checkpoint_with_other_settings_is_refused(killed, files, capsys, flag
     assert (out / "checkpoint.npz").read_bytes() == before
 
 
+def test_an_expert_s_own_elites_are_not_its_student_s(files, tmp_path, capsys):
+    """Table 2's 64 of 512 are more than a student's 32 samples."""
+    model, header = fac.load_model(files / "expert.npz")
+    fac.save_model(path := tmp_path / "expert.npz", model, {
+        **header, "planner": {"samples": 512, "elites": 64, "min_std": 0.2}})
+    arguments = distill_arguments(files, "--out", tmp_path / "run", "--expert", path, "--workers", 0)
+    assert fac.main([str(a) for a in arguments]) == 0, capsys.readouterr().err
+    planner = json.loads((tmp_path / "run" / "config.json").read_text())["planner"]
+    assert (planner["elites"], planner["min_std"]) == (0, 0.05)
+
+
 @pytest.mark.parametrize("spoil", [
     lambda header, arrays: header.pop("curve"), lambda header, arrays: header.update(settings=[1]),
     lambda header, arrays: header.update(seconds="1 h"),
+    lambda header, arrays: header.update(curve=[]), lambda header, arrays: header.update(curve=5),
     lambda header, arrays: arrays.update(step=np.float64("inf")),
     lambda header, arrays: arrays.pop("weights"),
     lambda header, arrays: arrays.update(weights=np.zeros(3, np.float32))])

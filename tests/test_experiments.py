@@ -237,7 +237,7 @@ def test_a_run_that_does_not_fit_its_figure_is_refused_before_the_work(tmp_path)
 
 @pytest.mark.parametrize("column, value", [
     ("return_mean", "nan"), ("step", "x"), ("settings", "[]"), ("settings", "{"),
-    ("evaluation_seed", "x"), ("returns", 5.0), ("ranks", "[0.5")])
+    ("evaluation_seed", "x"), ("returns", 5.0), ("ranks", "[0.5"), ("ranks", "[1]")])
 def test_a_damaged_row_is_shown(tmp_path, column, value):
     row = {**experiments.make_run("walker-run", 0, "TAP"), "step": 1, "return_mean": 2.0,
            "minutes": 1.0}

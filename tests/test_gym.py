@@ -91,8 +91,18 @@ def test_what_a_robot_raises_is_said_in_a_line(workers):
         fac.evaluate(model, "gym:gym_toys:Hot-v0", config, 1, 0, workers)
 
 
-def test_a_module_that_data_hides_is_refused():
-    with pytest.raises(fac.UserError, match="own_robot.py would be imported instead; give your"):
+def test_a_robot_s_end_that_raises_costs_no_episode(capsys):
+    model = fac.WorldModel.create(fac.ModelConfig(3, 2, 2, 2, 4, 4), np.random.default_rng(0))
+    config = fac.PlannerConfig(samples=2, iterations=1, action_repeat=1)
+    found = fac.evaluate(model, "gym:gym_toys:Stuck-v0", config, 2, 0, 0)
+    assert found["returns"] == [fallen(seed) for seed in fac.episode_seeds(0, 2)]
+    assert "Stuck-v0: close: RuntimeError('motor off failed')" in capsys.readouterr().err
+
+
+def test_a_module_that_data_hides_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "own_robot.py").touch()
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with pytest.raises(fac.UserError, match="own_robot.py may be imported instead; give your"):
         fac.make_robot("gym:own_robot:Walk-v0")
 
 

@@ -983,6 +983,19 @@ def test_minari_episodes_become_a_replay(tmp_path):
         import_expert.find_replay(tmp_path / "other.h5", sizes)
 
 
+def test_this_project_s_own_file_keeps_what_it_was_made_for(tmp_path):
+    """Such as one of other floats, which load_model sends here."""
+    state = {key: value.astype(np.float64) for key, value in weights().items()}
+    fac.write_npz(tmp_path / "own.npz", {"kind": "expert", "action_repeat": 4, "task": TASK,
+                                         "training": {"discount": 0.9, "horizon": 2}}, state)
+    flags = [str(tmp_path / "own.npz"), "--task", TASK, "--out"]
+    for more, repeat in ([], 4), (["--action-repeat", "2"], 2):
+        out = tmp_path / str(repeat)
+        assert import_expert.main([*flags, str(out), *more]) == 0
+        _, header = fac.load_model(out / "expert.npz")
+        assert fac.made_for(header, "x") == {"discount": 0.9, "horizon": 2, "action_repeat": repeat}
+
+
 def test_others_actions_are_within_the_robot_s_bounds(tmp_path):
     """Pendulum's are -2 to 2; this project's names say that they are scaled already."""
     pytest.importorskip("gymnasium")
@@ -995,6 +1008,12 @@ def test_others_actions_are_within_the_robot_s_bounds(tmp_path):
     for path in theirs, own:
         found = import_expert.find_replay(path, sizes, "gym:Pendulum-v1")["action"]
         np.testing.assert_allclose(found[~ends], action[~ends] / 2, atol=1e-3)
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(minari := tmp_path / "minari.hdf5", "w") as file:
+        file["episode_0/observations"] = np.zeros((rows + 1, 3), np.float32)
+        file["episode_0/actions"] = action
+    found = import_expert.find_replay(minari, sizes, "gym:Pendulum-v1")["action"]
+    np.testing.assert_allclose(found[:-1], action / 2, atol=1e-3)
     np.savez(theirs, observations=np.zeros((rows, 3)), actions=action * 3, timeouts=ends)
     with pytest.raises(fac.UserError, match="action: row 0, .* which are the robot's bounds"):
         import_expert.find_replay(theirs, sizes, "gym:Pendulum-v1")

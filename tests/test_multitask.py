@@ -406,6 +406,7 @@ def test_another_expert_than_the_student_s_is_refused(capsys, tmp_path, student)
     (lambda h, a: a[TASKS].fill(np.nan), [TASKS, "finite"]),
     (lambda h, a: h.update(tasks={"walker-walk": [24, 5]}), ["walker-walk", "[24, 6]", "[24, 5]"]),
     (lambda h, a: h.update(tasks=["walker-walk"]), ["tasks", "sizes by task"]),
+    (lambda h, a: h.update(of={"walker-walk": 5}), ["of: expected checksums by task"]),
     (lambda h, a: h["model"].update(enc_dim=0), ["model", "enc_dim", "at least 1"])])
 def test_a_damaged_file_is_named(student, tmp_path, change, parts):
     header, arrays = fac.read_npz(student[0] / "two" / "student.npz", ("multitask",))
