@@ -823,7 +823,8 @@ def test_an_expert_s_own_elites_are_not_its_student_s(files, tmp_path, capsys):
     model, header = fac.load_model(files / "expert.npz")
     fac.save_model(path := tmp_path / "expert.npz", model, {
         **header, "planner": {"samples": 512, "elites": 64, "min_std": 0.2}})
-    arguments = distill_arguments(files, "--out", tmp_path / "run", "--expert", path, "--workers", 0)
+    arguments = distill_arguments(files, "--out", tmp_path / "run", "--expert", path, "--workers",
+                                  "0")
     assert fac.main([str(a) for a in arguments]) == 0, capsys.readouterr().err
     planner = json.loads((tmp_path / "run" / "config.json").read_text())["planner"]
     assert (planner["elites"], planner["min_std"]) == (0, 0.05)
