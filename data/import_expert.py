@@ -554,7 +554,8 @@ def collect(model, config, environment, episodes, seed):
 
 
 def own_header(path):
-    """What a file of this project's says it was made for; {} of others'."""
+    """What a file of this project's, which `find_expert` could read, says it was made for; {} of
+    others'."""
     with contextlib.suppress(fac.UserError):
         header, _ = fac.read_npz(path, ("expert",))
         fac.made_for(header, path)
@@ -569,12 +570,12 @@ def run(args):
     need(args.collect is None or args.collect > 1, f"--collect must be at least 2, better "
          f"{LEAST_EPISODES}: distill holds out an episode in {LEAST_EPISODES}; not {args.collect}")
     fac.lookup_task(args.task)
-    made = own_header(args.file)
+    sizes, weights, kinds = find_expert(args.file, args.task)
+    made = own_header(args.file) if Path(args.file).suffix == ".npz" else {}
     if args.action_repeat is None:
         args.action_repeat = made.get("action_repeat", fac.task_repeat(args.task))
     fac.PlannerConfig(action_repeat=args.action_repeat)  # refuses what is none
     environment = args.collect and fac.make_robot(args.task, args.action_repeat)  # or misses it
-    sizes, weights, kinds = find_expert(args.file, args.task)
     arrays = args.replay and find_replay(args.replay, sizes, args.task)
     about = {"task": args.task, "imported_from": Path(args.file).name,
              "action_repeat": args.action_repeat}
