@@ -5,13 +5,12 @@ into a student whose latent, dynamics, reward and value fall apart into one smal
 action dimension. Each joint then plans alone: cheaper, and in parallel.
 
     python fac_tdmpc_ref.py distill --task reacher-hard
-    python fac_tdmpc_ref.py evaluate --model runs/reacher-hard-0/student.npz
 
 Part I is the method, to be read from top to bottom: 1 settings, 2 layers, 3 world model, 4
 distillation (Equation 4, Algorithm 1), 5 planning (Equations 2 and 3). It runs (`distill --plain`).
 Part II adds [D8], [D9] and `reuse` [D1], of which Part I has the settings only and the places where
 they come in, speed and the engineering. Experts learn, by Equation 1, in data/ [D6]. The README
-lists the departures from the paper, [D1] to [D9].
+lists the departures from the paper, [D1] to [D9]; [D10] is an option.
 
 The one idea that keeps it small: every model carries an agent axis N, and a centralized model is
 the case N = 1. There is one world model, one planner, one loss. The axes, everywhere:
@@ -32,11 +31,10 @@ action sequence that the expert's policy suggests to a plan. What a student comp
       -> the student's f_E -> cut into s^1, ..., s^N: (N, m, B), each repeated for K copies
     (s^i_h, a^i_h) -> f_T^i -> s^i_{h+1} for h < H: columns (L, B, K), copies side by side
                    -> f_R^i, f_Q^i -> agent i's shares of reward and value (N, L, B, K)
-    sum over i (with credit [D9] each i alone) -> R_h, Q_h (L, B, K) -> softmax over K
-                   -> divergence from the expert's (Equation 4)
+    sum over i (not for credit [D9]) -> R_h, Q_h (L, B, K) -> softmax over K -> divergence (Eq. 4)
 
-A layer is W (N, out, in), b (N, out, 1) and computes W @ x + b on x (N, in, B): samples last, so
-that activations run over long contiguous rows, and a torch Linear.weight goes in as weight[None].
+A layer is W (N, out, in), b (N, out, 1) and computes W @ x + b on x (N, in, B): samples last. A
+torch Linear.weight goes in as weight[None].
 """
 from __future__ import annotations
 
@@ -77,11 +75,11 @@ class ModelConfig(Settings):
     latent_dim: int = field(50, "m: an agent's latent features (Table 2; 5.1: 512 // N)", least=1)
     enc_dim: int = field(256, "hidden width of the encoder (Table 2)", least=1)
     mlp_dim: int = field(512, "hidden width of an agent's other networks (Table 2)", least=1)
-    expert_latent_dim: int = field(0, "features of the expert's latent, if that is encoded",
-                                   least=0)
+    expert_latent_dim: int = field(0, "features of an expert's latent to encode; 0: none", least=0)
     expert_enc_dim: int = field(256, "hidden width of the expert's encoder", least=1)
     expert_mlp_dim: int = field(0, "width of its policy and dynamics [D9]; 0: none", least=0)
     groups: str = field("", "robot's action dimensions of each agent, 0,2/1,3; '': in order")
+    residual: bool = field(False, "whether f_T adds to its latent, a student's [D10]")
 
     @property
     def agent_actions(self):
@@ -138,6 +136,7 @@ class DistillConfig(Settings):
                     paper="reverse", choices=("forward", "reverse"))
     encoder_input: str = field("latent", "the encoder reads the expert's latent or the observation "
                                "[D3]", paper="observation", choices=("latent", "observation"))
+    residual: bool = field(False, "a student's f_T adds to its latent: s' = s + f_T(s, a) [D10]")
     lr: float = field(1e-3, "Adam's learning rate [D1]", paper=1e-4, above=0)
     lr_schedule: str = field("cosine", "it falls to 0 like half a cosine, or stays [D1]",
                              paper="constant", choices=("cosine", "constant"))
@@ -149,14 +148,14 @@ class DistillConfig(Settings):
     held_out: float = field(0.1, "share of episodes to measure ranks in", least=1e-4, most=0.5)
 
 
-def student_config(theirs, num_agents, encoder_input, policy=False):
+def student_config(theirs, num_agents, encoder_input, policy=False, residual=False):
     """A student's sizes: layers an Nth as wide as its expert's, or 50; policy: keep that [D9]."""
     num_agents = theirs.dim_action if num_agents is None else num_agents
     below = {} if encoder_input == "observation" else {
         "expert_latent_dim": theirs.num_agents * theirs.latent_dim,
         "expert_enc_dim": theirs.enc_dim, "expert_mlp_dim": theirs.mlp_dim if policy else 0}
-    return ModelConfig(dim_obs=theirs.dim_obs, dim_action=theirs.dim_action, num_agents=num_agents,
-                       mlp_dim=max(theirs.mlp_dim // max(1, num_agents), 50), **below)
+    return ModelConfig(theirs.dim_obs, theirs.dim_action, num_agents, residual=residual, **below,
+                       mlp_dim=max(theirs.mlp_dim // max(1, num_agents), 50))
 
 
 def stream(seed, use, index=0):
@@ -369,8 +368,9 @@ class WorldModel:
         return z.reshape(1, -1, z.shape[-1]) if self.config.expert_latent_dim else obs[None]
 
     def next(self, z, a):
-        """s' = f_T(s, a).  z (N, m, B), a (N, d, B) -> (N, m, B)."""
-        return self.forward("_dynamics", np.concatenate([z, a], 1))
+        """s' = f_T(s, a), plus s [D10].  z (N, m, B), a (N, d, B) -> (N, m, B)."""
+        after = self.forward("_dynamics", np.concatenate([z, a], 1))
+        return z + after if self.config.residual else after
 
     def reward(self, z, a):
         """r^i = f_R^i(s^i, a^i) -> (N, B); the global reward is the sum over N."""
@@ -426,6 +426,7 @@ def unroll(model, z, actions, tapes=None):
     input x (N, m + d, L * B * K), columns in the order (L, B, K). tapes: a defaultdict(list)."""
     L, _, B, K = actions.shape
     n, m, d = model.config.num_agents, model.config.latent_dim, model.config.agent_actions
+    kept = m * model.config.residual  # features of s that s' adds to
     x = np.empty((n, m + d, L * B * K), z.dtype)
     x[:, m:] = actions.reshape(L, n, d, B * K).transpose(1, 2, 0, 3).reshape(n, d, -1)
     x[:, :m, :B * K] = np.repeat(z, K, axis=2)
@@ -433,6 +434,7 @@ def unroll(model, z, actions, tapes=None):
         now, after = (slice(i * B * K, (i + 1) * B * K) for i in (h, h + 1))
         x[:, :m, after] = model.forward("_dynamics", x[:, :, now],
                                         None if tapes is None else tapes[f"_dynamics {h}"])
+        x[:, :kept, after] += x[:, :kept, now]
     return x
 
 
@@ -462,10 +464,12 @@ def heads_backward(model, tapes, d_shares, grads):
 def unroll_backward(model, tapes, actions, dx, grads):
     """Walk `unroll` back from its x's gradient dx, used up: adds to `grads`, returns dz, as z."""
     (L, _, B, K), n, m = actions.shape, model.config.num_agents, model.config.latent_dim
+    kept = m * model.config.residual
     for h in reversed(range(L - 1)):
         now, after = (slice(i * B * K, (i + 1) * B * K) for i in (h, h + 1))
         dx[:, :, now] += model.backward("_dynamics", tapes[f"_dynamics {h}"],
                                         np.ascontiguousarray(dx[:, :m, after]), grads)
+        dx[:, :kept, now] += dx[:, :kept, after]
     return dx[:, :m, :B * K].reshape(n, m, B, K).sum(3)
 
 
@@ -519,8 +523,7 @@ def divergences(heads, targets, config, divergence=soft_kl):
     _, L, B, K = heads[0].shape
     lam = (config.lam ** np.arange(L) / B).astype(heads[0].dtype)[:, None]
     loss, means, d_shares = 0.0, [], []
-    coefs = (config.reward_coef, config.value_coef, config.value_coef)
-    for coef, shares, target in zip(coefs, heads, targets):
+    for coef, shares, target in zip((config.reward_coef, *[config.value_coef] * 2), heads, targets):
         target = target.reshape(-1, L, B, K)  # a row for all agents, or one for each
         output = shares.reshape(len(target), -1, L, B, K).sum(1)
         kl, d_output = divergence(output, target, config.temperature_student,
@@ -566,10 +569,9 @@ def perturbed_batch(expert, student, obs, actions, config, rng):
 def distill(expert, replay, config, num_agents=None, seed=0):
     """Algorithm 1: a factored student of an expert; yields it with each step's losses.
 
-    replay: the dataset, a `Replay`. Its `starts` are the rows that H + 1 actions follow, to learn
-    from and held out, its `sequences` the g_0 of rows and these actions. Part II's `Distiller` adds
-    `reuse` [D1], `expert_episodes`, `played_share`, `policy_share` [D8] and `targets` [D9]."""
-    sizes = student_config(expert.config, num_agents, config.encoder_input)
+    replay: the dataset, a `Replay`. Its `starts` are rows that H + 1 actions follow, to learn from
+    and held out, its `sequences` their g_0 and these. Part II's `Distiller` adds [D8] and [D9]."""
+    sizes = student_config(expert.config, num_agents, config.encoder_input, False, config.residual)
     optimizer, student = new_student(expert, sizes, seed)
     starts, _ = replay.starts(config.horizon + 1, config.held_out, seed)
     for t in range(config.steps):                                                       # line 3
@@ -605,10 +607,9 @@ def mppi(returns, mean, config, rngs, proposals=None):
 
     returns: actions (N, L, d, S) -> every G_i (N, S); mean (N, L, d): the first Gaussian's; rngs:
     one Generator for each agent; proposals (N, L, d, P): sequences that compete in every iteration.
-    Elites are chosen agent by agent: a plan's G is sum_i G_i(a_i), so the best of each is the best
-    of all (Equation 3, Proposition 1). N = 1 is centralized MPPI. Returns the new mean (N, L, d),
-    the last elites (N, L, d, E), scores (N, E) of sum 1, NaN where an agent has no finite G; of no
-    iterations None, None."""
+    Elites are chosen agent by agent: G is sum_i G_i(a_i), so the best of each is the best of all
+    (Equation 3, Proposition 1). N = 1 is centralized MPPI. Returns the new mean (N, L, d), the last
+    elites (N, L, d, E), scores (N, E) of sum 1, NaN without a finite G; None of no iterations."""
     mean, std, elites, scores = mean[..., None], F32(config.max_std), None, None
     G_proposals = None if proposals is None else returns(proposals)
     for _ in range(config.iterations):
@@ -1027,7 +1028,7 @@ class Distiller:
         need((replay.dim_obs, replay.dim_action) == (theirs.dim_obs, theirs.dim_action),
              f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, {replay.dim_action}), the "
              f"expert expects ({theirs.dim_obs}, {theirs.dim_action}); pass its own task's replay")
-        need(not theirs.expert_latent_dim, "an expert has an encoder of its own; this is a student")
+        need(not (theirs.expert_latent_dim or theirs.residual), "as expert: this is a student")
         self.expert, self.replay, self.config, self.seed = expert, replay, config, seed
         need(expert.has_policy or not (config.policy_share or config.expert_episodes),
              "the expert has no policy to learn from; pass --policy-share 0 --expert-episodes 0 "
@@ -1042,7 +1043,7 @@ class Distiller:
         self.pool_size = max(config.batch_size, min(POOL, needed))
         shared = dataclasses.replace(theirs, dim_action=sizes.get("dim_action", theirs.dim_action))
         sizes = dataclasses.replace(student_config(shared, num_agents, config.encoder_input,
-                                                   expert.has_policy), **sizes)
+                                                   expert.has_policy, config.residual), **sizes)
         copies = config.noise_samples * (config.horizon + 1)  # columns of a state
         check_memory(learning_numbers(sizes, config.batch_size * copies) + copies * (
             2 * self.pool_size * (theirs.dim_action + 3) + 24 * PART * theirs.mlp_dim) +
@@ -1209,11 +1210,11 @@ def horizon_returns(rewards, q1, q2, discount):
 
 
 def rank_by_state(distiller, rows, discount, rng):
-    """How alike student and expert order perturbed actions; they agree where the loss is 0.
+    """How alike student and expert order perturbed actions: by the global Q at each step h, and by
+    G (Equation 2), by which planning ranks, for each H; two (L, B).
 
     Spearman's correlation over 32 action sequences in the states of the replay's `rows` (B,); 1 is
-    the same order (section 4.4). Returns that of the global Q at each step h of the rollout, and
-    that of the global return G (Equation 2), by which planning ranks, for each H: two (L, B)."""
+    the same order, which a loss of 0 gives (section 4.4)."""
     student, config = distiller.student, dataclasses.replace(
         distiller.config, noise_samples=32, targets="joint")
     obs, actions = distiller.replay.sequences(rows, config.horizon + 1)
@@ -1299,7 +1300,7 @@ class Returns:
 
     def start(self, z, config):
         """Plan from the latent z (N, m, 1): at h = 0 the first products read (a, 1) only."""
-        self.horizon, self.discount = config.horizon, config.discount
+        self.horizon, self.discount, self.z = config.horizon, config.discount, z
         m = self.sizes.latent_dim
         self.first_at_start = [W[:, :, m:].copy() for W in self.first]  # (N, 2w + 2, d + 1)
         for W, at_start in zip(self.first, self.first_at_start):
@@ -1320,7 +1321,8 @@ class Returns:
             if h < self.horizon:
                 y = self._hidden(0, h, x)
                 out = self.to_reward @ y[:, half:]
-                np.matmul(self.to_latent, y[:, :half], out=x[:, :m])
+                after = self.to_latent @ y[:, :half]
+                x[:, :m] = after + (x[:, :m] if h else self.z) if self.sizes.residual else after
             else:
                 out = self.to_q @ self._hidden(1, h, x)
             G = G + F32(self.discount ** h) * out[:, 0]
@@ -1940,8 +1942,7 @@ def made_for(header, where):
 def check_rows(name, rows, most=None):
     """UserError names the first of rows (M, F) with a value that isn't finite, or above `most`."""
     for i, j in np.argwhere(~(np.abs(rows) <= (most or np.finfo(rows.dtype).max)))[:1]:
-        wrong = ("outside [-1, 1], which are the robot's bounds" if np.isfinite(rows[i, j]) else
-                 "not finite")
+        wrong = "outside [-1, 1] (its bounds)" if np.isfinite(rows[i, j]) else "not finite"
         raise UserError(f"{name}: row {i}, column {j}: {rows[i, j]} is {wrong}; drop its episode")
 
 

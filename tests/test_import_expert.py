@@ -1015,7 +1015,7 @@ def test_others_actions_are_within_the_robot_s_bounds(tmp_path):
     found = import_expert.find_replay(minari, sizes, "gym:Pendulum-v1")["action"]
     np.testing.assert_allclose(found[:-1], action / 2, atol=1e-3)
     np.savez(theirs, observations=np.zeros((rows, 3)), actions=action * 3, timeouts=ends)
-    with pytest.raises(fac.UserError, match="action: row 0, .* which are the robot's bounds"):
+    with pytest.raises(fac.UserError, match=r"action: row 0, .*outside \[-1, 1\] \(its bounds\)"):
         import_expert.find_replay(theirs, sizes, "gym:Pendulum-v1")
 
 
