@@ -361,7 +361,7 @@ def test_actions_are_scaled_to_the_action_spec(monkeypatch):
         return SimpleNamespace(observation={"position": np.zeros(15)}, reward=0.0)
 
     monkeypatch.setattr(suite, "load", lambda *_, **__: SimpleNamespace(
-        action_spec=lambda: spec, step=step))
+        action_spec=lambda: spec, step=step, close=None))
     env = fac.Environment("hopper-hop")
     for action, expected in ((-1, low), (1, high), (0, (low + high) / 2)):
         received.clear()
