@@ -314,12 +314,14 @@ def test_flatten_gives_views():
 
 @settings(max_examples=15, deadline=None)
 @given(st.sampled_from([1, 2, 3, 6]), st.integers(1, 4), st.integers(1, 4),
-       st.sampled_from(["forward", "reverse"]), st.booleans(), st.integers(0, 2 ** 31))
-def test_distill_loss_against_torch(n, batch, steps, kind, parts, seed):
+       st.sampled_from(["forward", "reverse"]), st.booleans(), st.booleans(),
+       st.integers(0, 2 ** 31))
+def test_distill_loss_against_torch(n, batch, steps, kind, parts, residual, seed):
     torch = pytest.importorskip("torch")
     import export_golden
     student, features, actions, targets, config = small_case(
-        n, batch, steps, kind, np.random.default_rng(seed), 0, (n,) if parts else ())
+        n, batch, steps, kind, np.random.default_rng(seed), 0, (n,) if parts else (), residual)
+    config = fac.dataclasses.replace(config, residual=residual)
     theirs = {k: torch.tensor(v, requires_grad=True) for k, v in student.params.items()}
     loss = export_golden.equation_4(theirs, torch.tensor(features), torch.tensor(actions),
                                    [torch.tensor(t) for t in targets], n, config)
