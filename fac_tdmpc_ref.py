@@ -8,9 +8,8 @@ action dimension. Each joint then plans alone: cheaper, and in parallel.
 
 Part I is the method, to be read from top to bottom: 1 settings, 2 layers, 3 world model, 4
 distillation (Equation 4, Algorithm 1), 5 planning (Equations 2 and 3). It runs (`distill --plain`).
-Part II adds [D8], [D9] and `reuse` [D1], of which Part I has the settings only and the places where
-they come in, speed and the engineering. Experts learn, by Equation 1, in data/ [D6]. The README
-lists the departures from the paper, [D1] to [D9]; [D10] is an option.
+Part II adds [D8], [D9] and `reuse` [D1], whose settings stand in Part I, speed and the engineering.
+Experts learn, by Equation 1, in data/ [D6]. The README lists the departures, [D1] to [D10].
 
 The one idea that keeps it small: every model carries an agent axis N, and a centralized model is
 the case N = 1. There is one world model, one planner, one loss. The axes, everywhere:
@@ -344,10 +343,14 @@ class WorldModel:
 
     def forward(self, name, x, tape=None):
         """Run one of its NETWORKS on x (N, in, B; encoders' N is 1); `backward` walks it back."""
-        return forward(NETWORKS[name], self.params, name, x, tape)
+        y = forward(NETWORKS[name], self.params, name, x, tape)
+        return y + x[:, :y.shape[1]] if name == "_dynamics" and self.config.residual else y  # [D10]
 
     def backward(self, name, tape, dy, grads):
-        return backward(NETWORKS[name], self.params, name, tape, dy, grads)
+        dx = backward(NETWORKS[name], self.params, name, tape, dy, grads)
+        if name == "_dynamics" and self.config.residual:
+            dx[:, :dy.shape[1]] += dy
+        return dx
 
     def encode(self, obs):
         """s = f_E(g).  obs (O, B) -> latents (N, m, B)."""
@@ -368,9 +371,8 @@ class WorldModel:
         return z.reshape(1, -1, z.shape[-1]) if self.config.expert_latent_dim else obs[None]
 
     def next(self, z, a):
-        """s' = f_T(s, a), plus s [D10].  z (N, m, B), a (N, d, B) -> (N, m, B)."""
-        after = self.forward("_dynamics", np.concatenate([z, a], 1))
-        return z + after if self.config.residual else after
+        """s' = f_T(s, a).  z (N, m, B), a (N, d, B) -> (N, m, B)."""
+        return self.forward("_dynamics", np.concatenate([z, a], 1))
 
     def reward(self, z, a):
         """r^i = f_R^i(s^i, a^i) -> (N, B); the global reward is the sum over N."""
@@ -426,7 +428,6 @@ def unroll(model, z, actions, tapes=None):
     input x (N, m + d, L * B * K), columns in the order (L, B, K). tapes: a defaultdict(list)."""
     L, _, B, K = actions.shape
     n, m, d = model.config.num_agents, model.config.latent_dim, model.config.agent_actions
-    kept = m * model.config.residual  # features of s that s' adds to
     x = np.empty((n, m + d, L * B * K), z.dtype)
     x[:, m:] = actions.reshape(L, n, d, B * K).transpose(1, 2, 0, 3).reshape(n, d, -1)
     x[:, :m, :B * K] = np.repeat(z, K, axis=2)
@@ -434,7 +435,6 @@ def unroll(model, z, actions, tapes=None):
         now, after = (slice(i * B * K, (i + 1) * B * K) for i in (h, h + 1))
         x[:, :m, after] = model.forward("_dynamics", x[:, :, now],
                                         None if tapes is None else tapes[f"_dynamics {h}"])
-        x[:, :kept, after] += x[:, :kept, now]
     return x
 
 
@@ -464,12 +464,10 @@ def heads_backward(model, tapes, d_shares, grads):
 def unroll_backward(model, tapes, actions, dx, grads):
     """Walk `unroll` back from its x's gradient dx, used up: adds to `grads`, returns dz, as z."""
     (L, _, B, K), n, m = actions.shape, model.config.num_agents, model.config.latent_dim
-    kept = m * model.config.residual
     for h in reversed(range(L - 1)):
         now, after = (slice(i * B * K, (i + 1) * B * K) for i in (h, h + 1))
         dx[:, :, now] += model.backward("_dynamics", tapes[f"_dynamics {h}"],
                                         np.ascontiguousarray(dx[:, :m, after]), grads)
-        dx[:, :kept, now] += dx[:, :kept, after]
     return dx[:, :m, :B * K].reshape(n, m, B, K).sum(3)
 
 
@@ -523,7 +521,8 @@ def divergences(heads, targets, config, divergence=soft_kl):
     _, L, B, K = heads[0].shape
     lam = (config.lam ** np.arange(L) / B).astype(heads[0].dtype)[:, None]
     loss, means, d_shares = 0.0, [], []
-    for coef, shares, target in zip((config.reward_coef, *[config.value_coef] * 2), heads, targets):
+    coefs = (config.reward_coef, config.value_coef, config.value_coef)
+    for coef, shares, target in zip(coefs, heads, targets):
         target = target.reshape(-1, L, B, K)  # a row for all agents, or one for each
         output = shares.reshape(len(target), -1, L, B, K).sum(1)
         kl, d_output = divergence(output, target, config.temperature_student,
@@ -952,14 +951,15 @@ def taught_batch(expert, student, obs, actions, config, rng):
     """`perturbed_batch` for the config's `targets`: if these are "credit", each agent's part of the
     expert's predictions, and copy 0 is what `actions` say. Perturbed actions (L, A, B, K) are in
     the order of the student's agents."""
-    perturbed, z = perturbed_actions(actions, config, rng), expert.encode(obs)
     if config.targets == "joint":
-        targets = predict(expert, z, perturbed)
+        features, perturbed, targets = perturbed_batch(expert, student, obs, actions, config, rng)
     else:
+        perturbed, z = perturbed_actions(actions, config, rng), expert.encode(obs)
         perturbed[..., :1] = actions[..., :1]
         predicted = predict(expert, z, perturbed, tapes := defaultdict(list))
         targets = credit(expert, tapes, perturbed, predicted, student.config)
-    return student.features(obs, z), perturbed[:, agent_order(student.config)], targets
+        features = student.features(obs, z)
+    return features, perturbed[:, agent_order(student.config)], targets
 
 
 # ==== 8. The same, in less time =======================================================
@@ -1028,7 +1028,7 @@ class Distiller:
         need((replay.dim_obs, replay.dim_action) == (theirs.dim_obs, theirs.dim_action),
              f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, {replay.dim_action}), the "
              f"expert expects ({theirs.dim_obs}, {theirs.dim_action}); pass its own task's replay")
-        need(not (theirs.expert_latent_dim or theirs.residual), "as expert: this is a student")
+        need(not theirs.expert_latent_dim, "an expert has an encoder of its own; this is a student")
         self.expert, self.replay, self.config, self.seed = expert, replay, config, seed
         need(expert.has_policy or not (config.policy_share or config.expert_episodes),
              "the expert has no policy to learn from; pass --policy-share 0 --expert-episodes 0 "
@@ -1210,11 +1210,9 @@ def horizon_returns(rewards, q1, q2, discount):
 
 
 def rank_by_state(distiller, rows, discount, rng):
-    """How alike student and expert order perturbed actions: by the global Q at each step h, and by
-    G (Equation 2), by which planning ranks, for each H; two (L, B).
-
-    Spearman's correlation over 32 action sequences in the states of the replay's `rows` (B,); 1 is
-    the same order, which a loss of 0 gives (section 4.4)."""
+    """Spearman's correlation of student and expert over 32 perturbed action sequences in the states
+    of the replay's `rows` (B,): of the global Q at each step h, and of G (Equation 2), by which
+    planning ranks, for each H; two (L, B). 1 is the same order, as for a loss of 0 (4.4)."""
     student, config = distiller.student, dataclasses.replace(
         distiller.config, noise_samples=32, targets="joint")
     obs, actions = distiller.replay.sequences(rows, config.horizon + 1)
@@ -1720,8 +1718,8 @@ def ask(method, value, where):
     try:
         return method(value)
     except (Exception, SystemExit) as error:
-        raise error if isinstance(error, UserError) else UserError(
-            f"{where}: the robot raised {shown(error)}") from error
+        need(isinstance(error, UserError), f"{where}: the robot raised {shown(error)}")
+        raise
 
 
 def robot_step(robot, action, sizes, t):
@@ -1793,9 +1791,10 @@ def suite_sizes(task):
     return sum(int(np.prod(s.shape)) for s in spec), int(np.prod(env.action_spec().shape))
 
 
-def episode_seeds(seed, episodes):
-    """Seeds of an evaluation's episodes: independent, whatever their number."""
-    streams = seed_sequence(seed).spawn(count(episodes, "episodes", 10 ** 5))
+def episode_seeds(seed, episodes, first=0):
+    """Seeds of an evaluation's episodes from `first` on: independent, whatever their number."""
+    streams = seed_sequence(seed, n_children_spawned=first).spawn(
+        count(episodes, "episodes", 10 ** 5))
     return [int(s.generate_state(1)[0]) for s in streams]
 
 
@@ -2319,7 +2318,7 @@ def command_distill(args):
     own = PlannerConfig(**theirs)  # the expert's
     search = student_planning(config) if getattr(args, "PlannerConfig.prior") != "none" else {}
     planning = from_args(PlannerConfig, args, **{
-        **theirs, **(search and {"elites": 0, "min_std": 0.05}), **search,  # not for its samples
+        **theirs, **(search and {"elites": 0, "min_std": PlannerConfig.min_std}), **search,
         "horizon": config.horizon, **({"returns": "plain"} if args.plain else {})})
     distiller_class = PlainDistiller if args.plain else Distiller
     out = Path(args.out or f"runs/{args.task}-{args.seed}")

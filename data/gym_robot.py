@@ -35,10 +35,10 @@ class GymRobot:
 
     def __init__(self, name, action_repeat=1):
         file = Path(__file__).with_name(f"{name.rpartition(':')[0]}.py")
-        for folder in os.environ.get("PYTHONPATH", "").split(os.pathsep):
-            if file.exists() and Path(folder, file.name).exists() and not file.samefile(
-                    Path(folder, file.name)):
-                raise ValueError(f"{file} may be imported instead; give your module another name")
+        theirs = (Path(folder, file.name)
+                  for folder in os.environ.get("PYTHONPATH", "").split(os.pathsep))
+        if file.exists() and any(path.exists() and not file.samefile(path) for path in theirs):
+            raise ValueError(f"{file} may be imported instead; give your module another name")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that there is a newer version of the ID
             try:

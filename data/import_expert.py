@@ -506,9 +506,9 @@ def find_replay(path, sizes, task=None):
         continues = found["continues"]
         need(not continues[-1], f"continues: row {rows - 1}, the last: expected False, as in every "
              "episode's last row; cut an unfinished one off, or end it there")
-        action = np.where(continues[:, None], found["action"], 0)
-        if theirs and fac.is_gym(task):
-            action = np.where(continues[:, None], from_bounds(action, task), 0)
+        scaled = theirs and fac.is_gym(task)
+        action = from_bounds(found["action"], task) if scaled else found["action"]
+        action = np.where(continues[:, None], action, 0)
         fac.check_rows("action", action, 1.0005)  # as float16 rounds
         observation = fac.compact(found["observation"])
         fac.check_rows("observation", observation)
@@ -571,15 +571,15 @@ def run(args):
          f"{LEAST_EPISODES}: distill holds out an episode in {LEAST_EPISODES}; not {args.collect}")
     fac.lookup_task(args.task)
     sizes, weights, kinds = find_expert(args.file, args.task)
-    made = own_header(args.file) if Path(args.file).suffix == ".npz" else {}
+    kept = own_header(args.file) if Path(args.file).suffix == ".npz" else {}
     if args.action_repeat is None:
-        args.action_repeat = made.get("action_repeat", fac.task_repeat(args.task))
+        args.action_repeat = kept.get("action_repeat", fac.task_repeat(args.task))
     fac.PlannerConfig(action_repeat=args.action_repeat)  # refuses what is none
     environment = args.collect and fac.make_robot(args.task, args.action_repeat)  # or misses it
     arrays = args.replay and find_replay(args.replay, sizes, args.task)
     about = {"task": args.task, "imported_from": Path(args.file).name,
              "action_repeat": args.action_repeat}
-    header = {**made, "kind": "expert", "model": vars(sizes), **about}
+    header = {**kept, "kind": "expert", "model": vars(sizes), **about}
     with fac.locked(out := Path(args.out)):
         for source, name in ((args.file, "expert.npz"), (args.replay, "replay.npz")):
             need(not source or Path(source).resolve() != (out / name).resolve(),

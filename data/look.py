@@ -101,8 +101,7 @@ def command_watch(args):
              f"steps, {args.model} every {configs[0].action_repeat}: they can't be shown in step")
     steps = fac.episode_steps(configs[0].action_repeat)
     fac.need(args.decisions <= steps, f"--decisions: an episode has {steps}, not {args.decisions}")
-    fac.need(args.episode < 10 ** 5, f"--episode: expected below 100,000, found {args.episode}")
-    *_, seed = fac.episode_seeds(args.seed, args.episode + 1)
+    (seed,) = fac.episode_seeds(args.seed, 1, first=args.episode)
     episodes = [watch_episode(*found, task, seed, args.decisions, args.every)
                 for found in models]
     images = draw_frames(episodes)

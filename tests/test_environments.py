@@ -415,6 +415,7 @@ def test_every_task_of_the_suite_works_or_says_why_not():
 def test_evaluation_seeds_are_distinct_and_do_not_depend_on_how_many():
     seeds = fac.episode_seeds(0, 50)
     assert len(set(seeds)) == 50 and seeds[:7] == fac.episode_seeds(0, 7)
+    assert seeds[4:7] == fac.episode_seeds(0, 3, first=4)
     assert all(0 <= s < 2 ** 32 for s in seeds)  # what dm_control's RandomState takes
     assert not set(seeds) & set(fac.episode_seeds(1, 50))
 
