@@ -1015,10 +1015,9 @@ class Distiller:
     The expert is frozen: what it predicts for a pool of states and their perturbed actions is
     computed once and learned from `reuse` times; by two threads: NumPy's products hold no GIL.
     num_agents: N, or `groups`; sizes: replace `student_config`'s. UserError if expert, replay and
-    config don't fit."""
+    config don't fit. A subclass may have its own `create`, `loss`, `perturb` and `ranks`."""
 
     create, loss, perturb = map(staticmethod, (new_student, distill_loss, taught_batch))
-    # or a subclass's own; ranks, too
 
     def __init__(self, expert, replay, config, num_agents=None, seed=0, **sizes):
         keep_memory()
@@ -1887,13 +1886,14 @@ def read_npz(path, kinds):
 
 
 def save_model(path, model, header, compress=False):
-    """Weights under TD-MPC's names; torch shapes where N = 1, else with a leading agent axis."""
+    """Weights (compress: as float16) under TD-MPC's names, in torch's shapes; N > 1 leads them."""
     arrays = {}
     for key, value in model.params.items():
         need(value.ndim == 3, f"{key}: expected (N, rows, columns), found {value.shape}")
         value = value[..., 0] if key.endswith("bias") or key.split(".")[1] == "1" else value
+        value = (value[0] if len(value) == 1 else value).astype("f2" if compress else F32)
         need(np.isfinite(value).all(), f"{path}: {key}: would hold values that are not finite")
-        arrays[key] = value[0] if len(value) == 1 else value
+        arrays[key] = value
     write_npz(path, {**header, "model": vars(model.config)}, arrays, compress)
 
 
@@ -1911,10 +1911,10 @@ def load_model(path, kinds=("expert", "student")):
             need(value is not None, f"{path}: {key}: missing; expected float32 {on_disk}")
             need(value.shape == on_disk, f"{path}: {key}: expected float32 {on_disk}, found "
                  f"{value.dtype} {value.shape}; the header's sizes and the weights disagree")
-            need(value.dtype == F32, f"{path}: {key}: expected float32, found {value.dtype}; "
-                 "data/import_expert.py converts it")
+            need(value.dtype in (F32, np.float16), f"{path}: {key}: expected float32, found "
+                 f"{value.dtype}; data/import_expert.py converts it")
             need(np.isfinite(value).all(), f"{path}: {key}: holds values that are not finite")
-            params[key] = np.ascontiguousarray(value.reshape(expected))
+            params[key] = np.ascontiguousarray(value.reshape(expected), F32)
     need(not arrays, f"{path}: {next(iter(arrays), None)}: unknown entry; expected TD-MPC's "
          f"state-dict names only, _pi's of one agent")
     return WorldModel(config, params), header

@@ -300,7 +300,20 @@ def test_weights_of_a_wrong_shape(expert_file, key, change):
     refusal(lambda: fac.load_model(path), path, key, f"expected float32 {shape}", f"{found}")
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float16", "int32"])
+def test_compressed_weights_are_float16_and_come_back_as_what_they_say(expert_file):
+    model, header = fac.load_model(expert_file)
+    fac.save_model(path := expert_file.parent / "half.npz", model, header, compress=True)
+    assert {v.dtype for v in contents(path)[1].values()} == {np.dtype(np.float16)}
+    half, again = fac.load_model(path)
+    assert again == header
+    for key, value in half.params.items():
+        assert value.dtype == F32
+        np.testing.assert_array_equal(value, model.params[key].astype(np.float16))
+    model.params["_Q1.3.bias"][0, 0] = 1e6  # infinite as float16
+    refusal(lambda: fac.save_model(path, model, header, True), "half.npz: _Q1.3.bias", "not finite")
+
+
+@pytest.mark.parametrize("dtype", ["float64", "int32"])
 def test_weights_of_a_wrong_dtype(expert_file, dtype):
     path = changed_model(expert_file, "_Q2.3.weight", lambda v: v.astype(dtype))
     refusal(lambda: fac.load_model(path), path, "_Q2.3.weight", "expected float32",
