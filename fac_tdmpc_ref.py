@@ -9,7 +9,7 @@ action dimension. Each joint then plans alone: cheaper, and in parallel.
 Part I is the method, to be read from top to bottom: 1 settings, 2 layers, 3 world model, 4
 distillation (Equation 4, Algorithm 1), 5 planning (Equations 2 and 3). It runs (`distill --plain`).
 Part II adds [D8], [D9] and `reuse` [D1], whose settings stand in Part I, speed and the engineering.
-Experts learn, by Equation 1, in data/ [D6]. The README lists the departures, [D1] to [D10].
+Experts learn, by Equation 1, in data/ [D6]. The README lists the departures, [D1] to [D9].
 
 The one idea that keeps it small: every model carries an agent axis N, and a centralized model is
 the case N = 1. There is one world model, one planner, one loss. The axes, everywhere:
@@ -32,8 +32,8 @@ action sequence that the expert's policy suggests to a plan. What a student comp
                    -> f_R^i, f_Q^i -> agent i's shares of reward and value (N, L, B, K)
     sum over i (not for credit [D9]) -> R_h, Q_h (L, B, K) -> softmax over K -> divergence (Eq. 4)
 
-A layer is W (N, out, in), b (N, out, 1) and computes W @ x + b on x (N, in, B): samples last. A
-torch Linear.weight goes in as weight[None].
+A layer is W (N, out, in), b (N, out, 1) and computes W @ x + b on x (N, in, B): samples last, so
+that activations run over long contiguous rows. A torch Linear.weight goes in as weight[None].
 """
 from __future__ import annotations
 
@@ -78,7 +78,6 @@ class ModelConfig(Settings):
     expert_enc_dim: int = field(256, "hidden width of the expert's encoder", least=1)
     expert_mlp_dim: int = field(0, "width of its policy and dynamics [D9]; 0: none", least=0)
     groups: str = field("", "robot's action dimensions of each agent, 0,2/1,3; '': in order")
-    residual: bool = field(False, "whether f_T adds to its latent, a student's [D10]")
 
     @property
     def agent_actions(self):
@@ -135,7 +134,6 @@ class DistillConfig(Settings):
                     paper="reverse", choices=("forward", "reverse"))
     encoder_input: str = field("latent", "the encoder reads the expert's latent or the observation "
                                "[D3]", paper="observation", choices=("latent", "observation"))
-    residual: bool = field(False, "a student's f_T adds to its latent: s' = s + f_T(s, a) [D10]")
     lr: float = field(1e-3, "Adam's learning rate [D1]", paper=1e-4, above=0)
     lr_schedule: str = field("cosine", "it falls to 0 like half a cosine, or stays [D1]",
                              paper="constant", choices=("cosine", "constant"))
@@ -147,14 +145,14 @@ class DistillConfig(Settings):
     held_out: float = field(0.1, "share of episodes to measure ranks in", least=1e-4, most=0.5)
 
 
-def student_config(theirs, num_agents, encoder_input, policy=False, residual=False):
+def student_config(theirs, num_agents, encoder_input, policy=False):
     """A student's sizes: layers an Nth as wide as its expert's, or 50; policy: keep that [D9]."""
     num_agents = theirs.dim_action if num_agents is None else num_agents
     below = {} if encoder_input == "observation" else {
         "expert_latent_dim": theirs.num_agents * theirs.latent_dim,
         "expert_enc_dim": theirs.enc_dim, "expert_mlp_dim": theirs.mlp_dim if policy else 0}
-    return ModelConfig(theirs.dim_obs, theirs.dim_action, num_agents, residual=residual, **below,
-                       mlp_dim=max(theirs.mlp_dim // max(1, num_agents), 50))
+    return ModelConfig(theirs.dim_obs, theirs.dim_action, num_agents,
+                       mlp_dim=max(theirs.mlp_dim // max(1, num_agents), 50), **below)
 
 
 def stream(seed, use, index=0):
@@ -343,14 +341,10 @@ class WorldModel:
 
     def forward(self, name, x, tape=None):
         """Run one of its NETWORKS on x (N, in, B; encoders' N is 1); `backward` walks it back."""
-        y = forward(NETWORKS[name], self.params, name, x, tape)
-        return y + x[:, :y.shape[1]] if name == "_dynamics" and self.config.residual else y  # [D10]
+        return forward(NETWORKS[name], self.params, name, x, tape)
 
     def backward(self, name, tape, dy, grads):
-        dx = backward(NETWORKS[name], self.params, name, tape, dy, grads)
-        if name == "_dynamics" and self.config.residual:
-            dx[:, :dy.shape[1]] += dy
-        return dx
+        return backward(NETWORKS[name], self.params, name, tape, dy, grads)
 
     def encode(self, obs):
         """s = f_E(g).  obs (O, B) -> latents (N, m, B)."""
@@ -568,9 +562,10 @@ def perturbed_batch(expert, student, obs, actions, config, rng):
 def distill(expert, replay, config, num_agents=None, seed=0):
     """Algorithm 1: a factored student of an expert; yields it with each step's losses.
 
-    replay: the dataset, a `Replay`. Its `starts` are rows that H + 1 actions follow, to learn from
-    and held out, its `sequences` their g_0 and these. Part II's `Distiller` adds [D8] and [D9]."""
-    sizes = student_config(expert.config, num_agents, config.encoder_input, False, config.residual)
+    replay: the dataset, a `Replay`. Its `starts` are the rows that H + 1 actions follow, to learn
+    from and held out; its `sequences` the g_0 of rows and these actions. What Part II's `Distiller`
+    adds is `reuse` [D1], `expert_episodes`, `played_share`, `policy_share` [D8], `targets` [D9]."""
+    sizes = student_config(expert.config, num_agents, config.encoder_input)
     optimizer, student = new_student(expert, sizes, seed)
     starts, _ = replay.starts(config.horizon + 1, config.held_out, seed)
     for t in range(config.steps):                                                       # line 3
@@ -1042,7 +1037,7 @@ class Distiller:
         self.pool_size = max(config.batch_size, min(POOL, needed))
         shared = dataclasses.replace(theirs, dim_action=sizes.get("dim_action", theirs.dim_action))
         sizes = dataclasses.replace(student_config(shared, num_agents, config.encoder_input,
-                                                   expert.has_policy, config.residual), **sizes)
+                                                   expert.has_policy), **sizes)
         copies = config.noise_samples * (config.horizon + 1)  # columns of a state
         check_memory(learning_numbers(sizes, config.batch_size * copies) + copies * (
             2 * self.pool_size * (theirs.dim_action + 3) + 24 * PART * theirs.mlp_dim) +
@@ -1297,7 +1292,7 @@ class Returns:
 
     def start(self, z, config):
         """Plan from the latent z (N, m, 1): at h = 0 the first products read (a, 1) only."""
-        self.horizon, self.discount, self.z = config.horizon, config.discount, z
+        self.horizon, self.discount = config.horizon, config.discount
         m = self.sizes.latent_dim
         self.first_at_start = [W[:, :, m:].copy() for W in self.first]  # (N, 2w + 2, d + 1)
         for W, at_start in zip(self.first, self.first_at_start):
@@ -1318,8 +1313,7 @@ class Returns:
             if h < self.horizon:
                 y = self._hidden(0, h, x)
                 out = self.to_reward @ y[:, half:]
-                after = self.to_latent @ y[:, :half]
-                x[:, :m] = after + (x[:, :m] if h else self.z) if self.sizes.residual else after
+                x[:, :m] = self.to_latent @ y[:, :half]
             else:
                 out = self.to_q @ self._hidden(1, h, x)
             G = G + F32(self.discount ** h) * out[:, 0]
@@ -1391,9 +1385,9 @@ def student_search(distiller, planning, states=256):
     """What a student plans with instead [D9], and what a wide search gains, (mean, standard error).
 
     Far from the policy are better plans, and plans that only the student's errors promise. So it
-    searches widely if, by two standard errors (as if states were independent), the expert thinks
-    more of the plans it finds so in held-out states. A narrow search of many agents, where samples
-    cost most, needs fewer, though no fewer than the elites that `planning` asks for."""
+    searches widely if, by three standard errors (as if states were independent; those of an episode
+    aren't), the expert thinks more of the plans it finds so in held-out states. A narrow search of
+    many agents, where samples cost most, needs fewer, though no fewer than `planning`'s elites."""
     rows = stream(distiller.seed, "search").choice(distiller.held_out_starts, states)
     obs, _ = distiller.replay.sequences(rows, 1)
     wide = dataclasses.replace(planning, max_std=max(planning.max_std, WIDE_SEARCH["max_std"]))
@@ -1402,7 +1396,7 @@ def student_search(distiller, planning, states=256):
     gain, error = float(gains.mean()), float(gains.std(ddof=1) / states ** 0.5)
     small = {**SMALL_SEARCH, "samples": max(SMALL_SEARCH["samples"], planning.elites)}
     many = distiller.student.config.num_agents >= MANY_AGENTS and planning.max_std < wide.max_std
-    return WIDE_SEARCH if gain > 2 * error else small if many else {}, (gain, error)
+    return WIDE_SEARCH if gain > 3 * error else small if many else {}, (gain, error)
 
 
 # ==== 9. The same, in processes: workers plan for a part of the agents each ============

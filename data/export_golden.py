@@ -48,7 +48,7 @@ def last(x):
     return x.detach().swapaxes(-1, -2).numpy()
 
 
-def rollout(params, z, actions, residual=False):
+def rollout(params, z, actions):
     """Shares of reward and both Q, three (N, L, B, K): actions (L, A, B, K), z (N, B, m)."""
     steps, _, batch, noise = actions.shape
     z, outputs = z.repeat_interleave(noise, 1), []
@@ -56,7 +56,7 @@ def rollout(params, z, actions, residual=False):
         x = torch.cat([z, actions[h].reshape(len(z), -1, batch * noise).mT], -1)
         outputs.append([network(fac.NETWORKS[name], params, name, x).view(-1, batch, noise)
                         for name in fac.HEADS])
-        z = transition(params, x) + (z if residual else 0)
+        z = transition(params, x)
     return [torch.stack(head, 1) for head in zip(*outputs)]
 
 
@@ -70,7 +70,7 @@ def equation_4(params, features, actions, targets, agents, config):
     """Algorithm 1's loss; features (1, F, B), targets: the expert's three (L, B, K), or each
     agent's parts of these, (N, L, B, K)."""
     loss, coefs = 0.0, (config.reward_coef, config.value_coef, config.value_coef)
-    students = rollout(params, latents(params, features, agents), actions, config.residual)
+    students = rollout(params, latents(params, features, agents), actions)
     for coef, student, expert in zip(coefs, students, targets):
         expert = expert.reshape(-1, *student.shape[1:])
         student = student.reshape(len(expert), -1, *student.shape[1:]).sum(1)

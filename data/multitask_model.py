@@ -144,8 +144,7 @@ class MultitaskDistiller(fac.Distiller):
         self.start, self.dims = start, {
             task: [of.replay.dim_obs, of.replay.dim_action] for task, of in teachers.items()}
         wide = [start.config.dim_obs - EMBEDDING, start.config.dim_action] if start else [1, 1]
-        sizes = dataclasses.replace(student_sizes({**self.dims, "the start": wide}, centralized),
-                                    residual=config.residual)
+        sizes = student_sizes({**self.dims, "the start": wide}, centralized)
         fac.need(not start or start.config == sizes, "--start: expected a student for robots as "
                  f"wide as these, and of as many agents ({sizes}), found {start and start.config}")
         widest = max(teachers.values(), key=lambda teacher: teacher.replay.dim_action)

@@ -286,8 +286,7 @@ class OnlineStudent:
 
     def __init__(self, expert, num_agents, config, seed, own):
         self.config, self.seed, self.own = config, seed, own
-        sizes = fac.student_config(expert.config, num_agents, config.encoder_input, True,
-                                   config.residual)
+        sizes = fac.student_config(expert.config, num_agents, config.encoder_input, True)
         self.optimizer, self.model = fac.new_student(expert, sizes, seed)
 
     def update(self, expert, obs, actions):

@@ -418,7 +418,7 @@ def test_distill_prints_json_and_a_table(distilled):
                                  "0", f"{ms:.1f}", f"{experts / ms:.1f}"]
     header, _ = fac.read_npz(folder / "student.npz", ("student",))
     gain, error = result["wide_search_gain"]
-    width = (fac.WIDE_SEARCH if gain > 2 * error else fac.STUDENT_PLANNING)["max_std"]
+    width = (fac.WIDE_SEARCH if gain > 3 * error else fac.STUDENT_PLANNING)["max_std"]
     planning = fac.PlannerConfig(**{**fac.STUDENT_PLANNING, "samples": 16, "iterations": 1,
                                     "max_std": width})
     assert header["planner"].items() <= vars(planning).items()
@@ -466,7 +466,7 @@ def test_who_finds_better_plans_far_away_searches_widely(
 @pytest.mark.parametrize("agents, width, gain, noise, expected", [
     (11, 0.15, -1.0, 0.0, {}), (12, 0.15, -1.0, 0.0, {"samples": 16, "iterations": 2}),
     (12, 0.15, 1.0, 0.0, {"max_std": 1.0}), (3, 0.15, 1.0, 0.0, {"max_std": 1.0}),
-    (3, 0.15, 0.1, 1.0, {}), (3, 0.15, 0.2, 1.0, {"max_std": 1.0}),  # 1.6, 3.2 standard errors
+    (3, 0.15, 0.17, 1.0, {}), (3, 0.15, 0.2, 1.0, {"max_std": 1.0}),  # 2.7, 3.2 standard errors
     (12, 2.0, 0.0, 0.0, {})])  # one that a flag made wide
 def test_a_search_is_wide_where_its_gain_is_sure_and_small_where_many_agents_do_not(
         files, monkeypatch, agents, width, gain, noise, expected):

@@ -586,16 +586,14 @@ def test_part_one_is_at_most_700_lines_and_stands_alone():
         "check_settings", "seed_sequence"}  # which refuse what a user gives
 
 
-@pytest.mark.parametrize("num_agents, residual", [(1, False), (3, False), (3, True)])
-def test_the_distiller_is_algorithm_1_in_less_time(replay, monkeypatch, num_agents, residual):
+@pytest.mark.parametrize("num_agents", [1, 3])
+def test_the_distiller_is_algorithm_1_in_less_time(replay, monkeypatch, num_agents):
     """The same batches as Part I's loop, one a pool: the same weights to rounding."""
     monkeypatch.setattr(fac, "POOL", 16)
-    config = fac.dataclasses.replace(CONFIG, steps=30, targets="joint", policy_share=0.0, reuse=1,
-                                     residual=residual)
+    config = fac.dataclasses.replace(CONFIG, steps=30, targets="joint", policy_share=0.0, reuse=1)
     fast, losses = distilled(replay, config, 30, num_agents)
     plain = list(fac.distill(random_model(n=1, policy=True), replay, config, num_agents))
     student = plain[-1][0]
-    assert student.config.residual == fast.student.config.residual == residual
     for key in fast.optimizer.params:
         if key in ("_reward.4.bias", "_Q1.5.bias", "_Q2.5.bias"):  # a softmax knows no constants:
             continue  # Adam enlarges the rounding of a gradient of zero
