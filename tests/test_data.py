@@ -310,7 +310,8 @@ def test_compressed_weights_are_float16_and_come_back_as_what_they_say(expert_fi
         assert value.dtype == F32
         np.testing.assert_array_equal(value, model.params[key].astype(np.float16))
     model.params["_Q1.3.bias"][0, 0] = 1e6  # infinite as float16
-    refusal(lambda: fac.save_model(path, model, header, True), "half.npz: _Q1.3.bias", "not finite")
+    with np.errstate(over="ignore"):
+        refusal(lambda: fac.save_model(path, model, header, True), "half.npz: _Q1.3.bias", "finite")
 
 
 @pytest.mark.parametrize("dtype", ["float64", "int32"])
