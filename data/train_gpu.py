@@ -288,11 +288,9 @@ class Learner:
         return graph.replay
 
     def expert(self, i):
-        """Task i's model as it is now, rounded to float16: its file takes half the room."""
+        """Task i's model as it is now."""
         sizes = self.models[i].config
-        params = {**self.main.arrays(i, sizes), **self.pi.arrays(i, sizes)}
-        return fac.WorldModel(sizes, {k: np.float32(v.astype(np.float16))
-                                      for k, v in params.items()})
+        return fac.WorldModel(sizes, {**self.main.arrays(i, sizes), **self.pi.arrays(i, sizes)})
 
 
 def started(path, task, sizes):
@@ -454,6 +452,7 @@ class Run:
             if i < len(self.before):
                 about["before"] = self.before[i]
             try:
+                # as float16: half of the room
                 fac.save_model(folder / "expert.npz", model, {"kind": "expert", **about}, True)
             except fac.UserError as error:  # one task's failure is not the others'
                 print(error, file=sys.stderr)
