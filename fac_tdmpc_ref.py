@@ -76,7 +76,7 @@ class ModelConfig(Settings):
     mlp_dim: int = field(512, "hidden width of an agent's other networks (Table 2)", least=1)
     expert_latent_dim: int = field(0, "features of an expert's latent to encode; 0: none", least=0)
     expert_enc_dim: int = field(256, "hidden width of the expert's encoder", least=1)
-    expert_mlp_dim: int = field(0, "width of its policy and dynamics [D9]; 0: none", least=0)
+    prior_steps: int = field(0, "actions that an agent's own prior names [D9]; 0: none", least=0)
     groups: str = field("", "robot's action dimensions of each agent, 0,2/1,3; '': in order")
 
     @property
@@ -90,8 +90,9 @@ class PlannerConfig(Settings):
     """MPPI. A model's file may name others. Raises UserError for values that can't plan."""
     samples: int = field(128, "S: sequences drawn at once [D5]", paper=512, least=1, most=10 ** 6)
     iterations: int = field(4, "of MPPI [D5]; 0: its first mean acts", paper=6, least=0)
-    prior: str = field("none", "first mean: the last plan's, or of the expert's policy [D9]",
-                       repr=False, choices=("none", "policy"))
+    prior: str = field("last", "first mean: the last plan's, moved on, or what each agent's own "
+                       "prior (an expert's: its policy) would do [D9]",
+                       repr=False, choices=("last", "own"))
     elites: int = field(0, "best, which make the next mean; 0: samples / 8 (Table 2: 64)", least=0)
     pi_trajs: int = field(24, "P: policy proposals (Table 2)", least=0, most=10 ** 6)
     horizon: int = field(3, "H of Equation 2", least=0, most=EPISODE_STEPS - 1)
@@ -100,7 +101,8 @@ class PlannerConfig(Settings):
     max_std: float = field(2.0, "largest and first one (Table 2) [D9]", above=0)
     inverse_temperature: float = field(0.5, "elites score exp(this * G) (TD-MPC's code)", above=0)
     momentum: float = field(0.1, "part of the old mean in the new (TD-MPC's code)", least=0, most=1)
-    returns: str = field("fast", "Equation 2, plain or fast", choices=("fast", "plain"))
+    speed: str = field("fast", "Equation 2 by Part II or, plain, as Part I reads", repr=False,
+                       choices=("fast", "plain"))
     output: str = field("sampled", "an elite drawn by score (TD-MPC's code), or the mean [D5]",
                         paper="mean", choices=("sampled", "mean"))
     action_repeat: int = field(ACTION_REPEAT, "control steps a decision", repr=False)
@@ -112,18 +114,14 @@ class PlannerConfig(Settings):
 
 
 @dataclasses.dataclass(frozen=True)
-class DistillConfig(Settings):
-    """Algorithm 1. `--preset paper` takes each field's paper value."""
-    steps: int = field(14_000, "gradient steps (section 5.1: 10^5) [D1]", paper=100_000, least=1)
+class Algorithm1Config(Settings):
+    """Algorithm 1, as `distill` below reads it. `--preset paper` takes each field's paper value;
+    what Part II adds has its settings there, in `DistillConfig`."""
+    steps: int = field(7_000, "gradient steps (section 5.1: 10^5) [D1]", paper=100_000, least=1)
     batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=2)
     noise_samples: int = field(5, "K: copies of actions, perturbed [D1]", paper=10, least=2)
     noise_std: float = field(0.3, "deviation of the noise [D9]", paper=0.5, plain=0.5, above=0)
-    targets: str = field("credit", "each share learns its agent's part, or (joint) all of them "
-                         "the sum [D9]", paper="joint", plain="joint", choices=("credit", "joint"))
-    policy_share: float = field(0.5, "share of states where the policy's actions are perturbed, "
-                                "not those done [D8]", paper=0.0, plain=0.0, least=0, most=1)
     clip_actions: bool = field(True, "clip perturbed actions to [-1, 1] [D7]", paper=False)
-    reuse: int = field(4, "steps that learn from a state's perturbations [D1]", paper=1, least=1)
     horizon: int = field(3, "H of loss and planning (Table 2)", least=0, most=EPISODE_STEPS - 1)
     lam: float = field(0.5, "lambda (rho in Table 2): step h weighs lambda^h", least=0, most=1)
     reward_coef: float = field(0.5, "weight of the rewards' divergence (Table 2)", least=0)
@@ -139,19 +137,16 @@ class DistillConfig(Settings):
                              paper="constant", choices=("cosine", "constant"))
     warmup: int = field(200, "steps over which lr rises from zero [D1]", paper=0, least=0)
     grad_clip: float = field(10.0, "largest gradient norm (Table 2)", above=0)
-    expert_episodes: int = field(96, "that its policy plays first [D8]", paper=0, plain=0, least=0)
-    played_share: float = field(0.5, "share of states that are from these episodes [D8]",
-                                paper=0.0, plain=0.0, least=0, most=1)
     held_out: float = field(0.1, "share of episodes to measure ranks in", least=1e-4, most=0.5)
 
 
-def student_config(theirs, num_agents, encoder_input, policy=False):
-    """A student's sizes: layers an Nth as wide as its expert's, or 50; policy: keep that [D9]."""
+def student_config(theirs, num_agents, encoder_input, prior_steps=0):
+    """A student's sizes: hidden layers max(512 // N, 50) wide, of an expert whose are 512."""
     num_agents = theirs.dim_action if num_agents is None else num_agents
     below = {} if encoder_input == "observation" else {
         "expert_latent_dim": theirs.num_agents * theirs.latent_dim,
-        "expert_enc_dim": theirs.enc_dim, "expert_mlp_dim": theirs.mlp_dim if policy else 0}
-    return ModelConfig(theirs.dim_obs, theirs.dim_action, num_agents,
+        "expert_enc_dim": theirs.enc_dim}
+    return ModelConfig(theirs.dim_obs, theirs.dim_action, num_agents, prior_steps=prior_steps,
                        mlp_dim=max(theirs.mlp_dim // max(1, num_agents), 50), **below)
 
 
@@ -167,7 +162,7 @@ ENCODER = ("linear", "elu", "linear")
 MLP = ("linear", "elu", "linear", "elu", "linear")
 QNET = ("linear", "norm", "tanh", "linear", "elu", "linear")
 NETWORKS = {"_encoder": ENCODER, "_dynamics": MLP, "_reward": MLP, "_Q1": QNET, "_Q2": QNET,
-            "_pi": MLP}
+            "_pi": MLP, "_prior_encoder": ENCODER, "_prior": MLP}  # the last two are ours [D9]
 HEADS = ("_reward", "_Q1", "_Q2")
 NORM_EPS = 1e-5  # PyTorch's LayerNorm
 POLICY_STD, POLICY_CUT = 0.05, 0.3  # of TD-MPC's policy noise: deviation, and where it is cut
@@ -224,7 +219,8 @@ def norm(x, g, b):
 
 
 def norm_backward(dy, x, g):
-    """Gradients of y = g x_hat + b; dx loses its mean and its part along x_hat (LayerNorm)."""
+    """Gradients of y = g x_hat + b. With u = g dy: dx = (u - mean(u) - x_hat mean(u x_hat)) scale,
+    means over the features."""
     x_hat, scale = standardize(x)
     db = dy.sum(2, keepdims=True)
     dg = np.einsum("nfb,nfb->nf", dy, x_hat)[:, :, None]
@@ -316,16 +312,11 @@ class WorldModel:
 
     `params` maps TD-MPC's state-dict names to arrays with a leading agent axis, of one dtype
     (float32; float64 to check gradients). The encoder is centralized; only experts have TD-MPC's
-    policy, `_pi`. A student keeps of its `expert`, frozen: the encoder, whose latent its own reads
-    [D3]; and, to plan around [D9], the policy and the dynamics to roll it out in."""
+    policy, `_pi`, and only students a prior for each agent, `_prior` [D9]. A student keeps of its
+    expert the encoder alone, frozen, whose latent its own encoders read [D3]."""
 
     def __init__(self, config, params):
-        self.config, self.params, self.expert = config, params, None
-        if config.expert_latent_dim:
-            theirs = ModelConfig(config.dim_obs, config.dim_action, 1, config.expert_latent_dim,
-                                 config.expert_enc_dim, config.expert_mlp_dim or 1)  # 1: unused
-            self.expert = WorldModel(theirs, {k[len("_expert"):]: v for k, v in params.items()
-                                              if k.startswith("_expert")})
+        self.config, self.params = config, params
 
     @classmethod
     def create(cls, config, rng, policy=False, dtype=F32):
@@ -341,15 +332,19 @@ class WorldModel:
 
     def forward(self, name, x, tape=None):
         """Run one of its NETWORKS on x (N, in, B; encoders' N is 1); `backward` walks it back."""
-        return forward(NETWORKS[name], self.params, name, x, tape)
+        return forward(NETWORKS[name.removeprefix("_expert")], self.params, name, x, tape)
 
     def backward(self, name, tape, dy, grads):
         return backward(NETWORKS[name], self.params, name, tape, dy, grads)
 
     def encode(self, obs):
         """s = f_E(g).  obs (O, B) -> latents (N, m, B)."""
-        return self.encode_features(self.expert.encode(obs) if self.config.expert_latent_dim
-                                    else obs[None])
+        return self.encode_features(self.read(obs))
+
+    def read(self, obs):
+        """What its encoders read of obs (O, B): it, or its expert's latent [D3], (1, F, B)."""
+        return (self.forward("_expert_encoder", obs[None]) if self.config.expert_latent_dim
+                else obs[None])
 
     def encode_features(self, x, tape=None):
         """The trained encoder on (1, F, B); its output is cut into the agents' latents."""
@@ -385,6 +380,32 @@ class WorldModel:
     def has_policy(self):
         return "_pi.0.weight" in self.params
 
+    def latents(self, obs, search=True):
+        """All that agents know when they plan, obs (O, B) -> (N, m, B): s^i; with priors of their
+        own (N, 2 m, B): below s^i, which is left out without a search, what P^i reads [D9]."""
+        x = self.read(obs)
+        own = [self.prior_latents(x)] if self.config.prior_steps else []
+        return np.concatenate(([self.encode_features(x)] if search or not own else []) + own, 1)
+
+    def prior_latents(self, x, tape=None):
+        """What the priors read, of x (1, F, B), cut into the agents' parts as s is: (N, m, B)."""
+        e = self.forward("_prior_encoder", x, tape)
+        return e.reshape(self.config.num_agents, self.config.latent_dim, -1)
+
+    def prior(self, latents, steps):
+        """What each agent would do if it didn't search: `latents` -> actions (N, steps, d, B), by
+        its P^i, which names `prior_steps` of them [D9]; an expert's policy, rolled out."""
+        if self.has_policy:
+            return policy_rollout(self, latents, [F32(0)] * steps).swapaxes(0, 1)
+        sizes = self.config
+        actions = np.tanh(self.forward("_prior", latents[:, -sizes.latent_dim:]))
+        actions = actions.reshape(sizes.num_agents, sizes.prior_steps, sizes.agent_actions, -1)
+        return actions[:, np.minimum(np.arange(steps), sizes.prior_steps - 1)]
+
+    @property
+    def has_prior(self):
+        return self.has_policy or self.config.prior_steps > 0
+
 
 def networks(config, policy=False):
     """(name, agents, widths) of every network of a model."""
@@ -397,9 +418,9 @@ def networks(config, policy=False):
         found.append(("_pi", n, (m, *hidden, d)))
     if latent:
         found.append(("_expert_encoder", 1, (config.dim_obs, config.expert_enc_dim, latent)))
-    if latent and (width := config.expert_mlp_dim):
-        found += [("_expert_dynamics", 1, (latent + config.dim_action, width, width, latent)),
-                  ("_expert_pi", 1, (latent, width, width, config.dim_action))]
+    if L := config.prior_steps:
+        found += [("_prior_encoder", 1, (latent or config.dim_obs, config.enc_dim, n * m)),
+                  ("_prior", n, (m, *hidden, L * d))]
     return found
 
 
@@ -423,6 +444,7 @@ def unroll(model, z, actions, tapes=None):
     L, _, B, K = actions.shape
     n, m, d = model.config.num_agents, model.config.latent_dim, model.config.agent_actions
     x = np.empty((n, m + d, L * B * K), z.dtype)
+    # A is cut into N x d: of N = 3, d = 2 agent 0 has actions 0 and 1, agent 1 has 2 and 3, ...
     x[:, m:] = actions.reshape(L, n, d, B * K).transpose(1, 2, 0, 3).reshape(n, d, -1)
     x[:, :m, :B * K] = np.repeat(z, K, axis=2)
     for h in range(L - 1):
@@ -505,7 +527,7 @@ def distill_loss(student, features, actions, targets, config, grads=None, diverg
     if grads is not None:
         dx = heads_backward(student, tapes, d_shares, grads)
         dz = unroll_backward(student, tapes, actions, dx, grads)
-        student.encode_backward(dz, encoder_tape, grads)
+        student.encode_backward(dz, encoder_tape, grads)  # its dx is dropped: the expert is frozen
     return losses
 
 
@@ -517,8 +539,8 @@ def divergences(heads, targets, config, divergence=soft_kl):
     loss, means, d_shares = 0.0, [], []
     coefs = (config.reward_coef, config.value_coef, config.value_coef)
     for coef, shares, target in zip(coefs, heads, targets):
-        target = target.reshape(-1, L, B, K)  # a row for all agents, or one for each
-        output = shares.reshape(len(target), -1, L, B, K).sum(1)
+        target = target.reshape(-1, L, B, K)  # one row: all agents', joint; N: each its own
+        output = shares.reshape(len(target), -1, L, B, K).sum(1)  # the sum, or shares as they are
         kl, d_output = divergence(output, target, config.temperature_student,
                                   config.temperature_expert, config.kl)
         loss += coef * float((lam * kl).sum())
@@ -528,13 +550,14 @@ def divergences(heads, targets, config, divergence=soft_kl):
 
 
 def new_student(expert, config, seed):
-    """(Adam, student): a student with fresh weights, and Adam on all of them but the expert's,
-    which are the expert's own arrays."""
+    """(Adam, student): a student with fresh weights, and Adam on those that Algorithm 1 learns,
+    views of its vector, which each of its steps changes. The expert's are the expert's arrays."""
     student = WorldModel.create(config, stream(seed, "student"))
     frozen = {k: expert.params[k[len("_expert"):]] for k in student.params
               if k.startswith("_expert")}
-    optimizer = Adam({k: v for k, v in student.params.items() if not k.startswith("_expert")})
-    return optimizer, WorldModel(config, {**optimizer.params, **frozen})
+    priors = {k: v for k, v in student.params.items() if k.startswith("_prior")}
+    optimizer = Adam({k: v for k, v in student.params.items() if k not in {**frozen, **priors}})
+    return optimizer, WorldModel(config, {**optimizer.params, **priors, **frozen})
 
 
 def learning_rate(config, t):
@@ -563,8 +586,7 @@ def distill(expert, replay, config, num_agents=None, seed=0):
     """Algorithm 1: a factored student of an expert; yields it with each step's losses.
 
     replay: the dataset, a `Replay`. Its `starts` are the rows that H + 1 actions follow, to learn
-    from and held out; its `sequences` the g_0 of rows and these actions. What Part II's `Distiller`
-    adds is `reuse` [D1], `expert_episodes`, `played_share`, `policy_share` [D8], `targets` [D9]."""
+    from and held out; its `sequences` the g_0 of rows and these actions."""
     sizes = student_config(expert.config, num_agents, config.encoder_input)
     optimizer, student = new_student(expert, sizes, seed)
     starts, _ = replay.starts(config.horizon + 1, config.held_out, seed)
@@ -603,20 +625,23 @@ def mppi(returns, mean, config, rngs, proposals=None):
     one Generator for each agent; proposals (N, L, d, P): sequences that compete in every iteration.
     Elites are chosen agent by agent: G is sum_i G_i(a_i), so the best of each is the best of all
     (Equation 3, Proposition 1). N = 1 is centralized MPPI. Returns the new mean (N, L, d), the last
-    elites (N, L, d, E), scores (N, E) of sum 1, NaN without a finite G; None of no iterations."""
-    mean, std, elites, scores = mean[..., None], F32(config.max_std), None, None
+    elites (N, L, d, E) and their scores (N, E), of sum 1, NaN without a finite G."""
+    mean, std = mean[..., None], F32(config.max_std)
     G_proposals = None if proposals is None else returns(proposals)
     for _ in range(config.iterations):
+        # sample
         actions = np.stack([rng.standard_normal((*mean.shape[1:3], config.samples), F32)
                             for rng in rngs])
         actions *= std
         actions += mean
         np.clip(actions, -1, 1, out=actions)
+        # score
         G = returns(actions)
         if proposals is not None:
             actions = np.concatenate([actions, proposals], -1)
             G = np.concatenate([G, G_proposals], 1)
         G = np.where(np.isfinite(G), G, F32(-np.inf))  # these weigh nothing
+        # refit: each agent's own elites, axis 1 being the samples (Equation 3)
         best = np.argpartition(-G, config.num_elites - 1, axis=1)[:, :config.num_elites]
         elites = np.take_along_axis(actions, best[:, None, None], 3)
         G = np.take_along_axis(G, best, 1)
@@ -631,10 +656,10 @@ def mppi(returns, mean, config, rngs, proposals=None):
 
 
 def draw_elite(elites, scores, rngs):
-    """The first actions (N, d) of one elite of each agent, drawn by score (TD-MPC's code)."""
+    """The actions (N, L, d) of one elite of each agent, drawn by score (TD-MPC's code)."""
     pick = [min(np.searchsorted(np.cumsum(p), rng.random(), "right"), len(p) - 1)
             for p, rng in zip(scores, rngs)]
-    return np.stack([e[0, :, i] for e, i in zip(elites, pick)])
+    return np.stack([e[:, :, i] for e, i in zip(elites, pick)])
 
 
 def policy_noise(shape, rng):
@@ -662,18 +687,22 @@ class AgentPlanner:
 
     def reset(self, seeds=()):
         """Start an episode: mean zero. seeds: a SeedSequence an agent, before the first plan."""
-        sizes = self.model.config
-        self.mean = np.zeros((sizes.num_agents, self.config.horizon + 1, sizes.agent_actions), F32)
+        sizes, L = self.model.config, self.config.horizon + 1 if self.config.iterations else 1
+        self.mean = np.zeros((sizes.num_agents, L, sizes.agent_actions), F32)
         if seeds:
             self.rngs = [np.random.Generator(np.random.SFC64(seed)) for seed in seeds]
 
-    def plan(self, z, prior=None):
-        """z (N, m, 1) -> actions (N, d), from a prior (N, L, d) [D9], or the last mean moved on."""
-        mean, elites, scores = self.search(z, self.mean if prior is None else prior)
-        self.mean = np.concatenate([mean[:, 1:], np.zeros_like(mean[:, :1])], 1)
-        if self.config.output == "mean" or not self.config.iterations:
-            return mean[:, 0]
-        return draw_elite(elites, scores, self.rngs)
+    def plan(self, latents):
+        """`WorldModel.latents` (N, ., 1) -> actions (N, L, d), the first of which acts: a search
+        that begins from the agents' own priors [D9], or from the last mean, moved on."""
+        first = self.mean
+        if self.config.prior == "own":
+            first = self.model.prior(latents, self.mean.shape[1])[..., 0]
+        if not self.config.iterations:
+            return first
+        mean, elites, scores = self.search(latents[:, :self.model.config.latent_dim], first)
+        self.mean = np.concatenate([mean[:, 1:], np.zeros_like(mean[:, :1])], 1)  # warm start
+        return mean if self.config.output == "mean" else draw_elite(elites, scores, self.rngs)
 
     def search(self, z, mean):
         """`mppi` from the latent z (N, m, 1) and a first mean (N, L, d)."""
@@ -863,26 +892,41 @@ def learning_numbers(config, columns):
 def planning_numbers(sizes, config):
     """About how many numbers a plan holds: action sequences, and the widest layers of a block."""
     S, P = config.samples, config.pi_trajs
-    block = S if config.returns == "plain" else S // sample_blocks(sizes, S)
+    block = S if config.speed == "plain" else S // sample_blocks(sizes, S)
     return (2 * (S + P) * (config.horizon + 1) * sizes.dim_action +
             3 * (block + P) * sizes.num_agents * (sizes.latent_dim + 2 * sizes.mlp_dim))
 
 
-# ==== 7. Added to the paper: more states [D8], credit, a search around the policy [D9] =
+# ==== 7. Added to the paper: more states [D8], credit and priors of their own [D9] =====
 
-# how a student plans that was taught around its expert's policy, where no flag says otherwise
-STUDENT_PLANNING = {"prior": "policy", "max_std": 0.15, "samples": 32, "iterations": 3,
+@dataclasses.dataclass(frozen=True)
+class DistillConfig(Algorithm1Config):
+    """Algorithm 1 and what is added to it. `--preset plain` leaves the additions out."""
+    targets: str = field("credit", "each share learns its agent's part, or (joint) all of them "
+                         "the sum [D9]", paper="joint", plain="joint", choices=("credit", "joint"))
+    policy_share: float = field(0.5, "share of states where the policy's actions are perturbed, "
+                                "not those done [D8]", paper=0.0, plain=0.0, least=0, most=1)
+    reuse: int = field(4, "steps that learn from a state's perturbations [D1]", paper=1, least=1)
+    expert_episodes: int = field(96, "that its policy plays first [D8]", paper=0, plain=0, least=0)
+    played_share: float = field(0.5, "share of states that are from these episodes [D8]",
+                                paper=0.0, plain=0.0, least=0, most=1)
+    priors: bool = field(True, "each agent learns a prior of its own behind Algorithm 1 [D9]",
+                         paper=False, plain=False)
+
+
+# how a student with priors plans, where no flag says otherwise and no search was chosen
+STUDENT_PLANNING = {"prior": "own", "max_std": 0.15, "samples": 32, "iterations": 3,
                     "output": "mean"}
 SEARCH = [f.name for f in dataclasses.fields(PlannerConfig)  # what a student's file says of it
-          if f.name not in ("horizon", "discount", "returns", "action_repeat")]
-WIDE_SEARCH = {"max_std": 1.0}  # see `student_search`
-MANY_AGENTS, SMALL_SEARCH = 12, {"samples": 16, "iterations": 2}
+          if f.name not in ("horizon", "discount", "speed", "action_repeat")]
+CHOSEN = "max_std", "samples", "iterations"  # by playing, of these:
+SEARCHES = ({"iterations": 0}, {"samples": 16, "iterations": 2}, {},  # cheapest first: none, two
+            {"max_std": 1.0})                                         # narrow ones, a wide one
 
 
 def student_planning(config):
-    """Settings of a PlannerConfig that students distilled with this config plan with [D9]: around
-    the expert's policy, where they were taught around it; else as any model."""
-    return STUDENT_PLANNING if config.policy_share else {}
+    """Settings of a PlannerConfig that students distilled with this config plan with."""
+    return STUDENT_PLANNING if config.priors else {}
 
 
 def agent_order(sizes):
@@ -940,6 +984,31 @@ def credit(expert, tapes, actions, predicted, sizes):
     y = np.stack([predicted[0], (predicted[1] + predicted[2]) / 2])
     parts += (y - y[..., :1] - parts.sum(0)) / sizes.num_agents
     return [parts[:, 0], parts[:, 1], parts[:, 1]]
+
+
+def prior_optimizer(student):
+    """An Adam on the weights of a student's priors, which become views of its vector."""
+    adam = Adam({k: v for k, v in student.params.items() if k.startswith("_prior")})
+    student.params.update(adam.params)
+    return adam
+
+
+def prior_loss(student, x, targets, lam, grads=None):
+    """How far the agents' priors are from what they are taught [D9]; adds gradients to `grads`.
+
+        mean over B of sum_h lambda^h |P_h^i(e^i) - target_h^i|^2, summed over the agents i
+
+    x (1, F, B): what encoders read; e: `prior_latents` of it; targets (N, L, d, B)."""
+    tapes, (_, L, _, B) = ([], []), targets.shape
+    e = student.prior_latents(x, tapes[0])
+    y = np.tanh(student.forward("_prior", e, tapes[1]))                       # (N, L * d, B)
+    error = y.reshape(targets.shape) - targets
+    weights = (lam ** np.arange(L) / B).astype(error.dtype)[:, None, None]
+    if grads is not None:
+        dy = (2 * weights * error).reshape(y.shape)
+        de = student.backward("_prior", tapes[1], tanh_backward(dy, y), grads)
+        student.backward("_prior_encoder", tapes[0], de.reshape(1, -1, B), grads)
+    return float((weights * error ** 2).sum())
 
 
 def taught_batch(expert, student, obs, actions, config, rng):
@@ -1024,9 +1093,9 @@ class Distiller:
              f"expert expects ({theirs.dim_obs}, {theirs.dim_action}); pass its own task's replay")
         need(not theirs.expert_latent_dim, "an expert has an encoder of its own; this is a student")
         self.expert, self.replay, self.config, self.seed = expert, replay, config, seed
-        need(expert.has_policy or not (config.policy_share or config.expert_episodes),
-             "the expert has no policy to learn from; pass --policy-share 0 --expert-episodes 0 "
-             "--plan-prior none")
+        need(expert.has_policy or not (config.policy_share or config.expert_episodes or
+                                       config.priors), "the expert has no policy to learn from; "
+             "pass --policy-share 0 --expert-episodes 0 --no-priors")
         need(theirs.num_agents == 1 or config.targets == "joint", f"the expert has "
              f"{theirs.num_agents} agents, credit is for one; pass --targets joint")
         self.played = np.zeros((0, replay.dim_obs + replay.dim_action), np.float16)
@@ -1036,8 +1105,9 @@ class Distiller:
         needed = config.steps * config.batch_size // config.reuse
         self.pool_size = max(config.batch_size, min(POOL, needed))
         shared = dataclasses.replace(theirs, dim_action=sizes.get("dim_action", theirs.dim_action))
+        prior_steps = (config.horizon + 1) * config.priors
         sizes = dataclasses.replace(student_config(shared, num_agents, config.encoder_input,
-                                                   expert.has_policy), **sizes)
+                                                   prior_steps), **sizes)
         copies = config.noise_samples * (config.horizon + 1)  # columns of a state
         check_memory(learning_numbers(sizes, config.batch_size * copies) + copies * (
             2 * self.pool_size * (theirs.dim_action + 3) + 24 * PART * theirs.mlp_dim) +
@@ -1162,9 +1232,9 @@ class PlainDistiller(Distiller):
     """Part I's `distill` in a Distiller's place, for `distill --plain`."""
 
     def __init__(self, expert, replay, config, num_agents=None, seed=0):
-        need((config.targets, config.policy_share, config.expert_episodes, config.reuse) ==
-             ("joint", 0, 0, 1), "--plain is Algorithm 1 alone: without --targets, "
-             "--policy-share, --expert-episodes and --reuse")
+        need((config.targets, config.policy_share, config.expert_episodes, config.reuse,
+              config.priors) == ("joint", 0, 0, 1, False), "--plain is Algorithm 1 alone: without "
+             "--targets, --policy-share, --expert-episodes, --reuse and --priors")
         need(not isinstance(num_agents, str), "--plain cuts actions in their order; pass "
              "--num-agents for --agents")
         super().__init__(expert, replay, config, num_agents, seed)
@@ -1347,7 +1417,7 @@ class FastPlanner(AgentPlanner):
     def __init__(self, model, config):
         keep_memory()
         super().__init__(model, config)
-        plain = config.returns == "plain" or type(model).forward is not WorldModel.forward
+        plain = config.speed == "plain" or type(model).forward is not WorldModel.forward
         self.fast = None if plain else Returns(model)
 
     def returns_from(self, z):
@@ -1355,48 +1425,9 @@ class FastPlanner(AgentPlanner):
 
     def search(self, z, mean):
         mean, elites, scores = super().search(z, mean)
-        need(scores is None or np.isfinite(scores).all(), "planning: no action sequence has a "
+        need(np.isfinite(scores).all(), "planning: no action sequence has a "
              "finite return; the model's weights or the observation are far out of range")
         return mean, elites, scores
-
-
-# ---- What plans are worth, and how wide a student searches.
-
-def plan_gains(expert, model, config, obs, seed=0):
-    """What plans of the expert or a student, `model`, are worth above what the expert's policy
-    would do, in states obs (O, B): by the expert's own G, and by the model's (what they promise),
-    two (B,)."""
-    with one_thread():
-        s, z, planner = expert.encode(obs), model.encode(obs), FastPlanner(model, config)
-        policy, plans = policy_plan(expert, obs, config.horizon + 1, model.config), []
-        first = policy * F32(config.prior == "policy")
-        for b, seeds in enumerate(seed_sequence(seed).spawn(obs.shape[1])):
-            planner.reset(seeds.spawn(len(z)))
-            plans.append(planner.search(z[..., b:b + 1], first[..., b])[0])
-        both = np.stack([np.stack(plans, -1), policy], -1).swapaxes(0, 1)  # (L, N, d, B, 2)
-        both = both.reshape(len(both), -1, *both.shape[3:])
-        robot = np.argsort(np.arange(both.shape[1])[agent_order(model.config)])
-        G = [horizon_returns(*predict(*of), config.discount)[-1]
-             for of in ((expert, s, both[:, robot]), (model, z, both))]
-    return [g[:, 0] - g[:, 1] for g in G]
-
-
-def student_search(distiller, planning, states=256):
-    """What a student plans with instead [D9], and what a wide search gains, (mean, standard error).
-
-    Far from the policy are better plans, and plans that only the student's errors promise. So it
-    searches widely if, by three standard errors (as if states were independent; those of an episode
-    aren't), the expert thinks more of the plans it finds so in held-out states. A narrow search of
-    many agents, where samples cost most, needs fewer, though no fewer than `planning`'s elites."""
-    rows = stream(distiller.seed, "search").choice(distiller.held_out_starts, states)
-    obs, _ = distiller.replay.sequences(rows, 1)
-    wide = dataclasses.replace(planning, max_std=max(planning.max_std, WIDE_SEARCH["max_std"]))
-    gains = np.subtract(*(plan_gains(distiller.expert, distiller.student, config, obs)[0]
-                          for config in (wide, planning)))
-    gain, error = float(gains.mean()), float(gains.std(ddof=1) / states ** 0.5)
-    small = {**SMALL_SEARCH, "samples": max(SMALL_SEARCH["samples"], planning.elites)}
-    many = distiller.student.config.num_agents >= MANY_AGENTS and planning.max_std < wide.max_std
-    return WIDE_SEARCH if gain > 3 * error else small if many else {}, (gain, error)
 
 
 # ==== 9. The same, in processes: workers plan for a part of the agents each ============
@@ -1409,7 +1440,7 @@ def some_agents(model, i, j):
     config = dataclasses.replace(sizes, num_agents=j - i, groups="", expert_latent_dim=0,
                                  dim_action=(j - i) * sizes.agent_actions)
     return WorldModel(config, {k: np.ascontiguousarray(v[i:j]) for k, v in model.params.items()
-                               if k.startswith(("_dynamics", "_reward", "_Q"))})
+                               if k.startswith(("_dynamics", "_reward", "_Q", "_prior."))})
 
 
 def split_agents(agents, workers):
@@ -1460,10 +1491,9 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
 
     def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
         self.model, self.config, sequence = model, config, seed_sequence(seed)
-        self._teacher = model.expert or model
-        need(config.prior == "none" or self._teacher.has_policy, "the model holds no policy of an "
-             "expert for plans to begin from, since the expert has none or the student's encoder "
-             "reads the observation; pass --plan-prior none (evaluate: --prior none)")
+        need(config.prior == "last" or model.has_prior, "the model has no prior for plans to begin "
+             "from: it is a student distilled without, or an expert that has no policy; pass "
+             "--plan-prior last (evaluate: --prior last)")
         check_memory(planning_numbers(model.config, config), config, model.config)
         self._parts = split_agents(model.config.num_agents, workers)
         own, *others = ((some_agents(model, part.start, part.stop), config)
@@ -1482,28 +1512,28 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
         self.own.reset(seeds[self._parts[0]])
 
     def act(self, obs):
-        """obs (O,) -> action (A,), float32 in [-1, 1]. UserError: other shape, NaN, no finite G."""
+        """obs (O,) -> action (A,), float32 in [-1, 1]: the first of `plan`."""
+        action = np.empty(self.model.config.dim_action, F32)
+        action[agent_order(self.model.config)] = self.plan(obs)[:, 0].reshape(-1)
+        return action
+
+    def plan(self, obs):
+        """obs (O,) -> actions (N, L, d), of one step without a search. UserError: other shape, NaN,
+        no finite G."""
         obs = checked(obs, (self.model.config.dim_obs,), "observation")[:, None]
-        prior = None
         with one_thread():
-            z = self.model.encode(obs)
-            if self.config.prior == "policy":
-                steps = 1 + self.config.horizon * bool(self.config.iterations)
-                prior = policy_plan(self._teacher, obs, steps, self.model.config)[..., 0]
-            tasks = [(z[part], prior if prior is None else prior[part]) for part in self._parts]
+            latents = self.model.latents(obs, self.config.iterations > 0)
+            own, *others = (latents[part] for part in self._parts)
             try:
-                self._workers.send_all(tasks[1:])
-                plans = [self.own.plan(*tasks[0]), *self._workers.receive_all()]
+                self._workers.send_all(others)
+                return np.concatenate([self.own.plan(own), *self._workers.receive_all()])
             except BaseException:  # answers left unread would be the next decision's
                 self.close()
                 raise
-        action = np.empty(self.model.config.dim_action, F32)
-        action[agent_order(self.model.config)] = np.concatenate(plans).reshape(-1)
-        return action
 
 
 def _planning_worker(connection):
-    """Plans for its part of the agents: latents in, actions out; a list is `reset`'s seeds."""
+    """Plans for its part of the agents: latents in, plans out; a list is `reset`'s seeds."""
     planner = FastPlanner(*connection.recv())
     connection.send("ready")
     while True:
@@ -1511,7 +1541,7 @@ def _planning_worker(connection):
         if isinstance(message, list):
             planner.reset(message)
         else:
-            connection.send(planner.plan(*message))
+            connection.send(planner.plan(message))
 
 
 class WorkerError(UserError):
@@ -1894,6 +1924,9 @@ def save_model(path, model, header, compress=False):
 def load_model(path, kinds=("expert", "student")):
     """(model, header) of one of these kinds. UserError names file, key, expected and found."""
     header, arrays = read_npz(path, kinds)
+    if isinstance(header.get("model"), dict):
+        need(not header["model"].pop("expert_mlp_dim", 0), f"{path}: header: model: a student of "
+             "an earlier version, which held its expert's policy; distil it again")
     config = from_dict(ModelConfig, header.get("model"), f"{path}: header: model")
     params, policy = {}, config.num_agents == 1 and "_pi.0.weight" in arrays
     for name, i, kind, shape, _ in layers(config, policy):
@@ -2018,29 +2051,32 @@ def data_file(task, name):
 
 # ==== 12. Commands ====================================================================
 
-def episodes_of(model, task, config, seeds, environment, noise):
+def episodes_of(model, task, config, seeds, environment, noise, teacher):
     """Plan through the episode of each seed; yields its decisions, a list of observation (O,),
-    action (A,), reward and seconds of planning. environment, noise: as `play`'s."""
+    action (A,), reward, seconds of planning and, with a teacher, its plan (N * L * d,). The last
+    three arguments are `play`'s."""
     if environment is None:
         with contextlib.closing(make_robot(task, config.action_repeat)) as robot:
-            yield from episodes_of(model, task, config, seeds, robot, noise)
+            yield from episodes_of(model, task, config, seeds, robot, noise, teacher)
         return
-    planner, sizes = Planner(model, config), model.config
+    planners, sizes = [Planner(model, of) for of in (config, teacher) if of], model.config
     for seed in seeds:
-        planner.reset(seed)
+        for planner in planners:
+            planner.reset(seed)
         obs = checked(ask(environment.reset, seed, "reset"), (sizes.dim_obs,), "reset: observation")
         rng, decisions = stream(seed, "exploration"), []
         deviation = F32(rng.uniform(0, noise))
         for t in range(robot_steps(environment, config)):
             begin = time.perf_counter()
-            action = planner.act(obs)
+            action = planners[0].act(obs)
             seconds = time.perf_counter() - begin
+            taught = [planner.plan(obs).ravel() for planner in planners[1:]]
             if noise:
                 action = action + deviation * rng.standard_normal(action.shape, F32)
                 action = np.clip(action, -1, 1)
             before, (obs, reward, over, _) = obs, robot_step(environment, action, sizes, t)
             if obs is not None:
-                decisions.append((before, action, reward, seconds))
+                decisions.append((before, action, reward, seconds, *taught))
             if over:
                 break
         yield decisions
@@ -2052,7 +2088,8 @@ def _playing_worker(connection):
         connection.send(decisions)
 
 
-def play(model, task, config, seeds, workers=None, label="playing", environment=None, noise=0.0):
+def play(model, task, config, seeds, workers=None, label="playing", environment=None, noise=0.0,
+         teacher=None):
     """Plan through the episodes of `seeds`: observations (E, T, O), actions (E, T, A), rewards
     (E, T) and seconds of planning (E, T). T is the longest episode's; past a shorter one's end they
     are NaN, its rewards 0.
@@ -2060,14 +2097,16 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
     workers: processes that share the episodes [one for each core]; 0, or with an `environment`: all
     in this one. An episode depends on its seed, not on their number. environment: instead of the
     task's, see `robot_step`; with T as `episode_steps` if it has that. noise: each episode draws
-    the deviation of what is added to its actions, evenly from 0 to this."""
+    the deviation of what is added to its actions, evenly from 0 to this. teacher: a PlannerConfig,
+    by which the model also plans in each state; its plans (E, T, N * L * d) are a fifth array."""
     E, sizes, episodes, total = len(seeds), model.config, [], 0.0
     workers = 0 if environment is not None else min(
         E, cores() if workers is None else count(workers, "workers"))
-    here = episodes_of(model, task, config, seeds, environment, noise)
+    here = episodes_of(model, task, config, seeds, environment, noise, teacher)
     with progress(label, E, "episode") as bar, \
             Workers(_playing_worker, workers, "evaluation worker") as pool:
-        pool.send_all((model, task, config, seeds[w::workers], None, noise) for w in range(workers))
+        pool.send_all((model, task, config, seeds[w::workers], None, noise, teacher)
+                      for w in range(workers))
         for i in range(E):
             episodes.append(pool.receive(i % workers) if workers else next(here))
             total += sum(reward for *_, reward, _ in episodes[i])
@@ -2076,6 +2115,8 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
     T = max(map(len, episodes), default=0)
     found = [np.full((E, T, n), np.nan, F32) for n in (sizes.dim_obs, sizes.dim_action)]
     found += [np.zeros((E, T)), np.full((E, T), np.nan)]
+    if teacher:
+        found.append(np.full((E, T, sizes.dim_action * (teacher.horizon + 1)), np.nan, F32))
     for i, decisions in enumerate(episodes):
         for array, values in zip(found, zip(*decisions)):
             array[i, :len(decisions)] = values
@@ -2125,9 +2166,111 @@ def expert_episodes(distiller, task, config, workers=None, environment=None):
     """What `Distiller.add` takes: episodes in which the expert's policy acts, each with noise of
     another deviation [D8]. config: a PlannerConfig; workers, environment: as `play`'s."""
     seeds = training_seeds(distiller.seed, "expert episode", 0, distiller.config.expert_episodes)
-    policy = dataclasses.replace(config, prior="policy", iterations=0)
+    policy = dataclasses.replace(config, prior="own", iterations=0)
     return play(distiller.expert, task, policy, seeds, workers, "the expert plays", environment,
                 EXPERT_NOISE)[:2]
+
+
+PRIOR_ROUNDS, PRIOR_BATCH, PRIOR_LR = 3, 256, 5e-3
+OWN_NOISE = 0.3  # largest deviation of the noise in episodes that priors play
+
+
+def teach_priors(distiller, task, planning, workers=None, environment=None):
+    """Each agent learns its own prior [D9], in PRIOR_ROUNDS: what the expert's policy would do, in
+    the replay's and the played states and, from the second round on, in states that the priors get
+    into by themselves, a quarter as many episodes a round as the expert's policy played. Then
+    planning is taught back: what the student's search (`planning`) finds around the priors, in as
+    many episodes of theirs. Returns the priors' weights {"policy": ..., "plans": ...}."""
+    student, expert, config = distiller.student, distiller.expert, distiller.config
+    L, episodes = config.horizon + 1, -(-config.expert_episodes // 4)
+
+    def own_states(number, teacher=None):
+        obs, *_, plans = play(
+            student, task, dataclasses.replace(planning, prior="own", iterations=0),
+            training_seeds(distiller.seed, "prior episode", number * episodes, episodes), workers,
+            "the priors play", environment, OWN_NOISE, teacher)
+        lived = np.isfinite(obs).all(2)
+        return obs[lived].T, plans[lived].T if teacher else None
+
+    def policy_at(obs):
+        with one_thread():
+            return [expert_features(distiller, obs), np.concatenate([
+                policy_plan(expert, part, L, student.config)
+                for part in np.array_split(obs, -(-obs.shape[1] // 512), 1)], 3)]
+
+    known = distiller.replay.sequences(distiller.train_starts, 1)[0]
+    played = distiller.played[:, :distiller.replay.dim_obs].T.astype(F32)
+    data = [policy_at(np.concatenate([known, played], 1))]
+    for number in range(PRIOR_ROUNDS):
+        if number and episodes:
+            data.append(policy_at(own_states(number)[0]))
+        learn_priors(distiller, data, number)
+    taught = {"policy": prior_weights(student)}
+    if episodes:
+        obs, plans = own_states(0, planning)
+        plans = plans.reshape(student.config.num_agents, L, -1, obs.shape[1])
+        learn_priors(distiller, [(expert_features(distiller, obs), plans)], PRIOR_ROUNDS)
+        taught["plans"] = prior_weights(student)
+    return taught
+
+
+def prior_weights(student):
+    """A copy of a student's priors' weights."""
+    return {k: v.copy() for k, v in student.params.items() if k.startswith("_prior")}
+
+
+def expert_features(distiller, obs):
+    """What the student's encoders read of many observations (O, M): (1, F, M)."""
+    with one_thread():
+        return np.concatenate([distiller.student.read(part) for part in np.array_split(
+            obs, -(-obs.shape[1] // 512), 1)], 2)
+
+
+def learn_priors(distiller, data, number):
+    """A round of `prior_loss`: a quarter of Algorithm 1's steps. data: pairs of x (1, F, M) and
+    targets (N, L, d, M)."""
+    student, rng = distiller.student, stream(distiller.seed, "priors", number)
+    x, targets = (np.concatenate(arrays, -1) for arrays in zip(*data))
+    config = dataclasses.replace(distiller.config, lr=PRIOR_LR,
+                                 steps=-(-distiller.config.steps // 4))
+    adam = prior_optimizer(student)
+    with one_thread(), progress("teaching priors", config.steps, "step") as bar:
+        for t in range(config.steps):
+            chosen = rng.integers(x.shape[-1], size=PRIOR_BATCH)
+            loss = prior_loss(student, x[..., chosen], targets[..., chosen], config.lam, adam.grads)
+            adam.step(learning_rate(config, t), config.grad_clip)
+            bar.update()
+    check_finite("priors' loss is", loss, config.steps, config.lr)
+
+
+def choose_by_playing(distiller, task, taught, plannings, workers=None, environment=None):
+    """Which priors of `teach_priors` a student keeps, and which of the plannings, cheapest first,
+    it searches around them by: all play the same episodes, a sixth as many as the expert's policy
+    played; first the priors alone, then each search around the better ones. The best mean is kept,
+    or what is cheaper and, by the differences of episodes, within a standard error of it. Returns
+    the planning and what was played, a list of dicts; the student has the priors."""
+    played, student = [], distiller.student
+    seeds = training_seeds(distiller.seed, "choice", 0, -(-distiller.config.expert_episodes // 6))
+
+    def returns(name, planning):
+        student.params.update({k: v.copy() for k, v in taught[name].items()})
+        found = play(student, task, planning, seeds, workers, "choosing", environment)[2].sum(1)
+        played.append({"taught": name, **{key: getattr(planning, key) for key in CHOSEN},
+                       "returns": found.tolist()})
+        return found
+
+    reflex = dataclasses.replace(plannings[-1], iterations=0)
+    alone = {name: returns(name, reflex) for name in taught if seeds}
+    best = max(alone, key=lambda name: alone[name].mean(), default=[*taught][-1])
+    student.params.update(taught[best])
+    if not seeds or len(plannings) == 1:
+        return plannings[-1], played
+    found = [alone[best] if planning.iterations == 0 else returns(best, planning)
+             for planning in plannings]
+    behind = max(found, key=np.mean) - np.array(found)
+    within = behind.mean(1) <= behind.std(1) / max(1, len(seeds) - 1) ** 0.5
+    student.params.update(taught[best])
+    return plannings[int(np.argmax(within))], played
 
 
 CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correlation_h0",
@@ -2310,10 +2453,10 @@ def command_distill(args):
     expert, header, replay, path = load_data(args)
     theirs = {**preset(PlannerConfig), **made_for(header, path)}
     own = PlannerConfig(**theirs)  # the expert's
-    search = student_planning(config) if getattr(args, "PlannerConfig.prior") != "none" else {}
+    search = student_planning(config) if getattr(args, "PlannerConfig.prior") != "last" else {}
     planning = from_args(PlannerConfig, args, **{
         **theirs, **(search and {"elites": 0, "min_std": PlannerConfig.min_std}), **search,
-        "horizon": config.horizon, **({"returns": "plain"} if args.plain else {})})
+        "horizon": config.horizon, **({"speed": "plain"} if args.plain else {})})
     distiller_class = PlainDistiller if args.plain else Distiller
     out = Path(args.out or f"runs/{args.task}-{args.seed}")
     read_records(path)  # what is damaged is missed now
@@ -2350,17 +2493,24 @@ def load_data(args):
 
 
 def distil_and_save(distiller, args, planning, header, out):
-    """Algorithm 1 to its end; writes student, curve and configuration. Returns result's part, and
-    the student's planning, around the policy by `student_search` where no flag says otherwise."""
+    """Algorithm 1 to its end, then the priors and the choice of a search where no flag says
+    otherwise; writes student, curve and configuration. Returns result's part, and the student's
+    planning."""
     student, config, replay = distiller.student, distiller.config, distiller.replay
-    sizes = student.config
+    sizes, finished, played = student.config, {}, []
+
+    def planned(**search):
+        few = {name: max(search[name], planning.elites) for name in {"samples"} & {*search}}
+        return from_args(PlannerConfig, args, **{**vars(planning), **search, **few})
+
     settings = {"task": args.task, "seed": args.seed,
                 "num_agents": sizes.groups or sizes.num_agents,
                 "distill": vars(config), "data": data_checksums(distiller.expert, replay),
                 "action_repeat": planning.action_repeat}
     if (path := out / "student.npz").exists():  # a run that this one would replace
-        before, _ = read_npz(path, ("student",))
-        same_settings({key: before.get(key) for key in settings}, settings, path)
+        model, finished = load_model(path, ["student"])
+        same_settings({key: finished.get(key) for key in settings}, settings, path)
+        student.params.update(prior_weights(model))
     elif not (out / "checkpoint.npz").exists() and (path := next(out.glob("[cr]*.json"), None)):
         # config.json or result.json
         raise UserError(f"{path}: not this run's, which would replace it; choose another --out")
@@ -2368,35 +2518,44 @@ def distil_and_save(distiller, args, planning, header, out):
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
     curve, seconds, before = train_student(distiller, out, settings, planning, args.workers)
-    ranks, gain = rank_results(distiller, 256, planning.discount), None
-    if planning.prior == "policy":
-        search, gain = student_search(distiller, planning)
-        planning = from_args(PlannerConfig, args, **{**vars(planning), **search})
+    ranks = rank_results(distiller, 256, planning.discount)
+    if finished:
+        own, played = made_for(finished, path), finished.get("played", [])
+        if planning.prior == own.get("prior") == "own":
+            planning = planned(**{name: own[name] for name in CHOSEN if name in own})
+    elif config.priors:
+        taught = teach_priors(distiller, args.task, planning, args.workers)
+        if planning.prior == "own":
+            planning, played = choose_by_playing(
+                distiller, args.task, taught, [*dict.fromkeys(
+                    planned(**search) for search in SEARCHES)], args.workers)
     save_model(out / "student.npz", student, {
         "kind": "student", **settings, "training": header.get("training", {}),
-        "planner": {name: getattr(planning, name) for name in SEARCH}})
+        "planner": {name: getattr(planning, name) for name in SEARCH}, "played": played})
     write_json(out / "config.json", {**settings, "planner": vars(planning)})
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
             "steps": config.steps, "seconds": round(seconds, 1), "seconds_total": before,
-            "kl_reward": curve[-1][3], "kl_value": curve[-1][4],
-            **ranks, "wide_search_gain": gain, "max_std": planning.max_std,
-            "samples": planning.samples, "iterations": planning.iterations, "out": str(out),
+            "kl_reward": curve[-1][3], "kl_value": curve[-1][4], **ranks, "played": played,
+            **{name: getattr(planning, name) for name in CHOSEN}, "out": str(out),
             "picture": drawn(draw_curve, out / "curve.png", curve,
                              f"{args.task}, seed {args.seed}")}, planning
 
 
 COMPARED = {"expert": "the expert", "student": "the student", "policy": "its policy alone",
-            "same_search": "expert, searching like its student"}
+            "same_search": "expert, searching like its student", "reflex": "its priors alone"}
 
 
 def compared(expert, student):
-    """What distill compares, (model, planning) by COMPARED's keys: these two, the expert's policy
-    alone, and the expert searching around it like its student [D9]: what the model alone saves."""
-    (model, own), search = expert, {name: getattr(student[1], name) for name in SEARCH}
+    """What distill compares, (model, planning) by COMPARED's keys: these two; the expert's policy
+    alone; if the student searches, its priors alone, and the expert searching around its policy
+    like it around these: what the model alone saves [D9]."""
+    (model, own), (learner, planning) = expert, student
     found = {"expert": expert, "student": student}
     if model.has_policy:
-        found["policy"] = model, dataclasses.replace(own, prior="policy", iterations=0)
-    if search["prior"] == "policy":
+        found["policy"] = model, dataclasses.replace(own, prior="own", iterations=0)
+    if planning.prior == "own" and planning.iterations:
+        found["reflex"] = learner, dataclasses.replace(planning, iterations=0)
+        search = {name: getattr(planning, name) for name in SEARCH}
         found["same_search"] = model, dataclasses.replace(own, **{**search, "pi_trajs": 0})
     return found
 
@@ -2446,7 +2605,8 @@ def report(result, plannings):
         result["expert_versions"] == software()) else "recorded with other versions"
     horizons = [result[f"{kind}_horizon"] for kind in ("expert", "student")]
     over = [f", H = {h}" if horizons[0] != horizons[1] else "" for h in horizons]
-    budgets = [f"{config.samples} x {config.iterations}" for config in plannings]
+    budgets = [f"{config.samples} x {config.iterations}" if config.iterations else "0"
+               for config in plannings]
     print(f"\n{result['task']}, {result['episodes']} episodes, evaluation seed "
           f"{result['eval_seed']}, horizon {' and '.join(map(str, dict.fromkeys(horizons)))}\n")
     rows = [("", "MPPI", "return", "ms a decision", "speed-up")]
@@ -2454,6 +2614,7 @@ def report(result, plannings):
             (f"expert ({source}), one process{over[0]}", budgets[0], "expert", "expert"),
             (COMPARED["policy"], "0", "policy", "policy"),
             (COMPARED["same_search"], budgets[1], "same_search", "same_search"),
+            (f"student, N = {result['num_agents']}, its priors alone", "0", "reflex", "reflex"),
             (f"student, N = {result['num_agents']}, one process{over[1]}", budgets[1], "student",
              "student_in_process"),
             (f"student, workers beside: {result['plan_workers']}", "", "",
@@ -2463,6 +2624,7 @@ def report(result, plannings):
                          f"{result[f'{who}_return_std']:.0f}" if who else "the same plans",
                          f"{ms:.1f}", f"{result['plan_ms_expert'] / ms:.1f}"))
     print_table(rows)
+    report_played(result)
     q, g, known, error, held = (result[f"rank_correlation_{key}"] for key in (
         "by_step", "returns", "returns_training", "returns_se", "episodes"))
     spread = f"± {error[-1]:.3f}, standard error over {held} held-out episodes; " if error else ""
@@ -2470,6 +2632,23 @@ def report(result, plannings):
     print(f"\nreturn kept {kept}, rank correlation of Q {q[0]:.3f} (h = 0) to {q[-1]:.3f} (h = "
           f"{len(q) - 1}), of the return {g[-1]:.3f} ({spread}{known[-1]:.3f} in training states), "
           + "distilled in {seconds:.0f} s, {seconds_total:.0f} s in all, {out}/".format_map(result))
+
+
+def report_played(result):
+    """Print what `choose_by_playing` saw: returns, and by what each is below the best one."""
+    if not (played := result["played"]):
+        return
+    best = np.array(max((of["returns"] for of in played), key=np.mean))
+    print(f"\nchosen by playing {len(best)} episodes of the run's own seeds (below the best ± "
+          "standard error): {samples} x {iterations}, deviation {max_std}\n".format_map(result))
+    rows = [("priors taught", "MPPI", "first deviation", "return", "below the best")]
+    for of in played:
+        behind, search = best - np.array(of["returns"]), of["iterations"]
+        rows.append((f"the expert's {of['taught']}" if of["taught"] == "policy" else
+                     "the student's plans", f"{of['samples']} x {search}" if search else "0",
+                     f"{of['max_std']}" if search else "-", f"{np.mean(of['returns']):.0f}",
+                     f"{behind.mean():.0f} ± {behind.std() / max(1, len(best) - 1) ** 0.5:.0f}"))
+    print_table(rows)
 
 
 def return_kept(student, expert):
@@ -2489,8 +2668,8 @@ def command_evaluate(args):
     model, header = load_model(args.model)
     task = args.task or header.get("task")
     own = made_for({**header, "task": task}, args.model)
-    if getattr(args, "PlannerConfig.prior") == "none" and own.get("prior") == "policy":
-        own = {name: value for name, value in own.items() if name not in SEARCH}  # around it
+    if getattr(args, "PlannerConfig.prior") == "last" and own.get("prior") == "own":
+        own = {name: value for name, value in own.items() if name not in SEARCH}  # around these
     planning = from_args(PlannerConfig, args, **own)
     need(task, f"{args.model}: header: no task; pass --task")
     need(task == header.get("task") or not args.record, f"{args.model}: header: task: expected "
@@ -2572,11 +2751,8 @@ def make_parser():
     sub = add_command(commands, "distill", command_distill, "Distil a task's expert into a "
                       "factored student (Algorithm 1), then evaluate and time both with MPPI.",
                       epilog="Given again, a cut-off run goes on; a finished one is evaluated. "
-                      f"A student searches with --plan-max-std {WIDE_SEARCH['max_std']} if the "
-                      "expert values the plans that it finds so more, in held-out states; another "
-                      f"of {MANY_AGENTS} agents or more with --plan-samples "
-                      f"{SMALL_SEARCH['samples']} --plan-iterations {SMALL_SEARCH['iterations']}; "
-                      "unless told otherwise.")
+                      "Which search a student plans with (none, 16 x 2, 32 x 3, or 32 x 3 with "
+                      "--plan-max-std 1) is chosen by playing, unless flags tell.")
     add = sub.add_argument
     add("--task", default="reacher-hard", help="one of: " + TASK_NAMES)
     add("--seed", type=natural, default=0, help="of distillation [0]")

@@ -274,14 +274,12 @@ def distil(task, seed, case, settings):
     expert, header = fac.load_model(fac.data_file(task, "expert.npz"))
     distiller = distiller_of(case)(expert, fac.Replay(fac.data_file(task, "replay.npz")), config,
                                    own["num_agents"], seed)
-    search = fac.STUDENT_PLANNING if case == "D8" else fac.student_planning(config)
-    if case == "D9" or config.encoder_input == "observation":  # the latter keeps no policy
-        search = {}
-    planning = planning_for(header, {**search, **about, "horizon": config.horizon})
+    planning = planning_for(header, {**fac.student_planning(config), **about,
+                                     "horizon": config.horizon})
     student, environment = distiller.student, None
     if case == "TAP":  # whose actions are others, which the expert's policy doesn't know
         environment = DecodingEnvironment(task, expert, distiller.vae, planning.action_repeat)
-        planning = dataclasses.replace(planning, prior="none", max_std=2.0)
+        planning = dataclasses.replace(planning, prior="last", max_std=2.0)
     every = -(-config.steps // own["evaluations"])
     with contextlib.closing(distiller):
         if config.expert_episodes:
@@ -289,6 +287,8 @@ def distil(task, seed, case, settings):
         for _ in distiller.run():
             if distiller.t % every and distiller.t < config.steps:
                 continue
+            if planning.prior == "own":
+                fac.teach_priors(distiller, task, planning, 0)
             row = measure(student, task, planning, own["episodes"], environment)
             if not environment:  # others' ranks are of the robot's actions
                 q, g = distiller.ranks(256, planning.discount)

@@ -630,7 +630,7 @@ def report(result):
                   f"{MAX_NOISE} on the actions"]
     if not result["policy"]:
         lines += ["no policy (_pi): planning goes without its proposals, which costs the expert "
-                  "return; distill needs --policy-share 0 --expert-episodes 0 --plan-prior none"]
+                  "return; distill needs --policy-share 0 --expert-episodes 0 --no-priors"]
     if not episodes:
         lines += [f"distill needs --replay FILE beside --expert {result['out']}/expert.npz, or run "
                   f"this again with --collect {LEAST_EPISODES}"]

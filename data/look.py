@@ -27,14 +27,13 @@ def choose_renderer():
                         "OSMesa (libosmesa6)")
 
 
-def shares(model, z, config, obs=None):
-    """What a plan that each agent makes anew from z (N, m, 1) is worth above doing nothing (N,).
-    obs (O, 1): what z is of, where plans start from the expert's policy [D9]."""
-    n = model.config.num_agents
-    returns = functools.partial(fac.h_step_return, model, z, config=config)
+def shares(model, obs, config):
+    """What a plan that each agent makes anew from obs (O, 1) is worth above doing nothing (N,)."""
+    n, latents = model.config.num_agents, model.latents(obs)
+    returns = functools.partial(fac.h_step_return, model, latents[:, :model.config.latent_dim],
+                                config=config)
     nothing = np.zeros((n, config.horizon + 1, model.config.agent_actions), fac.F32)
-    first = fac.policy_plan(model.expert or model, obs, config.horizon + 1, model.config)[
-        ..., 0] if config.prior == "policy" else nothing
+    first = model.prior(latents, config.horizon + 1)[..., 0] if config.prior == "own" else nothing
     plan, _, _ = fac.mppi(returns, first, config, [np.random.default_rng(0) for _ in range(n)])
     worth = returns(np.stack([plan, nothing], -1))
     return worth[:, 0] - worth[:, 1]
@@ -49,7 +48,7 @@ def watch_episode(path, model, header, task, seed, decisions, every):
     obs, actions, rewards, seconds = (x[0] for x in fac.play(
         model, task, config, [seed], label=f"playing {path}", environment=environment))
     pictures = frames_at(task, seed, actions, range(0, decisions, every), config.action_repeat)
-    frames = [(picture, shares(model, model.encode(seen), config, seen), rewards[:t].sum())
+    frames = [(picture, shares(model, seen, config), rewards[:t].sum())
               for t, picture in pictures.items() for seen in [obs[t][:, None]]]
     name = f"{header['kind']}, N = {model.config.num_agents}"
     return frames, name, 1e3 * float(np.median(seconds)), float(rewards.sum())
@@ -340,8 +339,6 @@ def command_agreement(args):
     with fac.one_thread():
         ceiling, explained = additive_ceiling(expert, obs[:, :24], actions[..., :24], NOISE,
                                               config.discount, rng).mean(-1).tolist()
-    gain, promise = (x.mean().item() for x in fac.plan_gains(expert, student, config, obs)
-                     ) if expert.has_policy else (None, None)
     played, done, rewards, _ = fac.play(student, task, config,
                                         fac.episode_seeds(args.seed, args.episodes))
     worst = int(rewards.sum(1).argmin())
@@ -359,16 +356,13 @@ def command_agreement(args):
     fac.drawn(fac.save_figure, args.out, figure)
     result = {"out": args.out, "task": task, "held_out": known.mean(1).tolist(),
               "worst_episode": own.mean(1).tolist(), "when": when.tolist(),
-              "return_worst": float(rewards[worst].sum()), "plan_gain": gain,
-              "plan_promise": promise, "ceiling": ceiling, "ceiling_variance": explained}
+              "return_worst": float(rewards[worst].sum()), "ceiling": ceiling,
+              "ceiling_variance": explained}
     fac.print_table([("joint", *map(str, range(len(own)))), *(
         (name, *(f"{x:.2f}" for x in result[key]))
         for name, key in (("held-out states", "held_out"), ("worst episode", "worst_episode")))])
     print(f"a sum over action dimensions, fitted, ranks the expert's G at "
           f"{', '.join(f'{x:.2f}' for x in ceiling)} (H = 0, 1, ...; noise of {NOISE})")
-    if expert.has_policy:
-        print(f"a plan promises {promise:.2f} above the expert's policy, by the student's G; by "
-              f"the expert's it is worth {gain:.2f}")
     print(args.out)
     return result
 

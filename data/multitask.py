@@ -31,7 +31,7 @@ from tdmpc2 import Checkpoint  # noqa: E402
 
 MOST_ACTIONS = 6  # of the paper's robots here
 MARKS = (0.1, 0.3, 1.0)  # shares of the steps after which Figure 10's students play
-ALONE = {"prior": "policy", "iterations": 0}  # of a PlannerConfig: what the policy says
+ALONE = {"prior": "own", "iterations": 0}  # of a PlannerConfig: what the policy says
 
 
 def named(tasks):
@@ -167,7 +167,7 @@ def marked(steps):
 
 def read_config(args):
     """The DistillConfig that the flags give; by default with a single student's steps a task."""
-    return fac.from_args(fac.DistillConfig, args, encoder_input="observation",
+    return fac.from_args(fac.DistillConfig, args, encoder_input="observation", priors=False,
                          steps=fac.DistillConfig.steps * len(args.tasks))
 
 
@@ -203,7 +203,7 @@ def command_evaluate(args):
     """evaluate: a multi-task student's returns in each of its tasks, beside its teachers'."""
     student, header = load(args.model)
     config = fac.from_dict(fac.DistillConfig, header.get("distill"), f"{args.model}: distill")
-    around, found = getattr(args, "PlannerConfig.prior") != "none", {}
+    around, found = getattr(args, "PlannerConfig.prior") != "last", {}
     checkpoint = read_teacher(args)
     for task in named(args.tasks) or student.dims:
         fac.need(task in student.dims, f"--tasks: {task}: {args.model} is of "
@@ -312,7 +312,7 @@ def play_marks(task, seed, case, settings, folder, data):
 def ranks_of(student, replay, header, discount):
     """Distiller.ranks of one task's student in states that a multi-task run has held out."""
     config = fac.from_dict(fac.DistillConfig, header["distill"], "a student's header: distill")
-    with contextlib.closing(fac.Distiller(student.expert, fac.Replay(replay), config,
+    with contextlib.closing(fac.Distiller(student.teacher, fac.Replay(replay), config,
                                           seed=header["seed"])) as distiller:
         distiller.student = student
         return distiller.ranks(256, discount)
@@ -439,7 +439,7 @@ def make_parser():
            "of each task that --teacher's policy plays as replay [those in --data]")
     option = add("evaluate", command_evaluate, "Plan with a student in each of its tasks, by "
                  "default around its teacher's policy (defaults below are of that search); with "
-                 "--prior none it plans alone.",
+                 "--prior last it plans alone.",
                  "the student's", True)
     option("--seed", type=fac.natural, default=0, help="of the episodes [0]")
     option("--episodes", type=positive, default=20, help="of each task [20]")

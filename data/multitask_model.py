@@ -63,9 +63,29 @@ class Multitask(fac.WorldModel):
         params["_encoder.0.weight"] = W[:, :, :dim_obs] * scale[:, None, :dim_obs]
         for key in ("_encoder.2.weight", "_encoder.2.bias"):
             params[key] = params[key][:, :n * sizes.latent_dim]
-        student = fac.WorldModel(sizes, {key: v.copy() for key, v in params.items()})
-        student.expert = teacher  # whose policy may begin plans
+        student = OfTask(sizes, {key: v.copy() for key, v in params.items()})
+        student.teacher = teacher
         return student
+
+
+class OfTask(fac.WorldModel):
+    """A student of one task, without priors of its own: plans may begin from what the policy of
+    its `teacher` would do, whose latent stands below each agent's."""
+    teacher = None
+
+    @property
+    def has_prior(self):
+        return self.teacher is not None
+
+    def latents(self, obs, search=True):
+        z = self.encode(obs)
+        theirs = self.teacher.encode(obs) if self.teacher else z[:1, :0]
+        return np.concatenate([z, np.repeat(theirs, len(z), 0)], 1)
+
+    def prior(self, latents, steps):
+        theirs = latents[:1, self.config.latent_dim:]
+        actions = fac.policy_rollout(self.teacher, theirs, [fac.F32(0)] * steps)
+        return actions.reshape(steps, len(latents), -1, latents.shape[2]).swapaxes(0, 1)
 
 
 def weights(config):

@@ -49,8 +49,9 @@ def main(episodes=24, updates=400, steps=3000, out=Path("runs/own-robot")):
     around = fac.PlannerConfig(**fac.STUDENT_PLANNING)
     distiller.add(*fac.expert_episodes(distiller, None, around, environment=robot))
     list(distiller.run())  # each step's losses
-    search, _ = fac.student_search(distiller, around)  # how wide
-    around = fac.PlannerConfig(**{**fac.STUDENT_PLANNING, **search})
+    taught = fac.teach_priors(distiller, None, around, environment=robot)
+    around, _ = fac.choose_by_playing(distiller, None, taught, [
+        fac.dataclasses.replace(around, **search) for search in fac.SEARCHES], environment=robot)
     distiller.close()
     for kind, model, plan in (("expert", expert, planning), ("student", distiller.student, around)):
         fac.save_model(out / f"{kind}.npz", model, {"kind": kind, "planner": vars(plan)})

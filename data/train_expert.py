@@ -286,8 +286,12 @@ class OnlineStudent:
 
     def __init__(self, expert, num_agents, config, seed, own):
         self.config, self.seed, self.own = config, seed, own
-        sizes = fac.student_config(expert.config, num_agents, config.encoder_input, True)
+        sizes = fac.student_config(expert.config, num_agents, config.encoder_input,
+                                   (config.horizon + 1) * config.priors)
         self.optimizer, self.model = fac.new_student(expert, sizes, seed)
+        self.priors = fac.prior_optimizer(self.model) if config.priors else None
+        self.optimizers = {"student": self.optimizer, **(
+            {"priors": self.priors} if config.priors else {})}
 
     def update(self, expert, obs, actions):
         """One step of Algorithm 1 on the first `batch_size` of observations (O, B) and actions
@@ -302,7 +306,11 @@ class OnlineStudent:
         actions = fac.around_policy(expert, obs, actions, config.policy_share, rng)
         batch = fac.taught_batch(expert, self.model, obs, actions[..., None], config, rng)
         _, *divergences = fac.distill_loss(self.model, *batch, config, self.optimizer.grads)
-        self.optimizer.step(fac.learning_rate(config, t), config.grad_clip)
+        self.optimizer.step(rate := fac.learning_rate(config, t), config.grad_clip)
+        if self.priors:
+            plans = fac.policy_plan(expert, obs, L, self.model.config)
+            fac.prior_loss(self.model, batch[0], plans, config.lam, self.priors.grads)
+            self.priors.step(rate, config.grad_clip)
         return divergences
 
 
@@ -532,8 +540,9 @@ class Training:
         """Write the checkpoint and then, for it holds their rows, the curve."""
         learned = self.learner.state()
         if self.student:
-            learned.update({**named("student", fac.optimizer_state(self.student.optimizer)),
-                            **named("own", self.student.own.state())})
+            learned.update(named("own", self.student.own.state()))
+            for name, optimizer in self.student.optimizers.items():
+                learned.update(named(name, fac.optimizer_state(optimizer)))
         for key, value in learned.items():
             fac.check_finite(f"weights ({key}) are", value, self.learner.updates, self.config.lr)
         header = {key: getattr(self, key) for key in ("settings", "decisions", "allowed", "seconds",
@@ -551,9 +560,10 @@ class Training:
             fac.same_settings(header["settings"], self.settings, path)
             self.learner.load(arrays)
             if self.student:
-                optimizer, own = self.student.optimizer, self.student.own
-                fac.load_optimizer(optimizer, unnamed("student", fac.optimizer_state(optimizer),
-                                                      arrays))
+                for name, optimizer in self.student.optimizers.items():
+                    fac.load_optimizer(optimizer, unnamed(name, fac.optimizer_state(optimizer),
+                                                          arrays))
+                own = self.student.own
                 own.load(unnamed("own", own.state(), arrays))
             self.buffer.load(arrays)
             for key in ("decisions", "allowed", "seconds", "curve"):

@@ -495,7 +495,7 @@ def make_parser():
     add("--json", action="store_true", help="print one JSON object as the last line of stdout")
     fac.add_config(parser, ExpertConfig, skip=SKIPPED, **DEFAULTS)
     fac.add_config(parser, fac.PlannerConfig, "MPPI while training", "plan-",
-                   skip=("discount", "action_repeat", "prior", "returns", "output", "horizon"),
+                   skip=("discount", "action_repeat", "prior", "speed", "output", "horizon"),
                    **PLANNING)
     parser.set_defaults(run=train)
     return parser
