@@ -8,7 +8,7 @@ action dimension. Each joint then plans alone: cheaper, and in parallel.
 
 Part I is the method, to be read from top to bottom: 1 settings, 2 layers, 3 world model, 4
 distillation (Equation 4, Algorithm 1), 5 planning (Equations 2 and 3). It runs (`distill --plain`).
-Part II adds [D8], [D9] and `reuse` [D1], whose settings stand in Part I, speed and the engineering.
+Part II adds [D8], [D9] and `reuse` [D1], each with its settings, speed and the engineering.
 Experts learn, by Equation 1, in data/ [D6]. The README lists the departures, [D1] to [D9].
 
 The one idea that keeps it small: every model carries an agent axis N, and a centralized model is
@@ -346,18 +346,14 @@ class WorldModel:
         return (self.forward("_expert_encoder", obs[None]) if self.config.expert_latent_dim
                 else obs[None])
 
-    def encode_features(self, x, tape=None):
-        """The trained encoder on (1, F, B); its output is cut into the agents' latents."""
-        z = self.forward("_encoder", x, tape)
+    def encode_features(self, x, tape=None, name="_encoder"):
+        """A trained encoder on (1, F, B); its output is cut into the agents' latents."""
+        z = self.forward(name, x, tape)
         return z.reshape(self.config.num_agents, self.config.latent_dim, -1)
 
-    def encode_backward(self, dz, tape, grads):
+    def encode_backward(self, dz, tape, grads, name="_encoder"):
         """Walk `encode_features` back from dz (N, m, B): adds to `grads`, returns dx (1, F, B)."""
-        return self.backward("_encoder", tape, dz.reshape(1, -1, dz.shape[-1]), grads)
-
-    def features(self, obs, z):
-        """What its encoder reads (1, F, B): obs (O, B), or z, the expert's latents of obs [D3]."""
-        return z.reshape(1, -1, z.shape[-1]) if self.config.expert_latent_dim else obs[None]
+        return self.backward(name, tape, dz.reshape(1, -1, dz.shape[-1]), grads)
 
     def next(self, z, a):
         """s' = f_T(s, a).  z (N, m, B), a (N, d, B) -> (N, m, B)."""
@@ -383,18 +379,13 @@ class WorldModel:
     def latents(self, obs, search=True):
         """All that agents know when they plan, obs (O, B) -> (N, m, B): s^i; with priors of their
         own (N, 2 m, B): below s^i, which is left out without a search, what P^i reads [D9]."""
-        x = self.read(obs)
-        own = [self.prior_latents(x)] if self.config.prior_steps else []
-        return np.concatenate(([self.encode_features(x)] if search or not own else []) + own, 1)
-
-    def prior_latents(self, x, tape=None):
-        """What the priors read, of x (1, F, B), cut into the agents' parts as s is: (N, m, B)."""
-        e = self.forward("_prior_encoder", x, tape)
-        return e.reshape(self.config.num_agents, self.config.latent_dim, -1)
+        x, own = self.read(obs), self.config.prior_steps > 0
+        names = ["_encoder"] * (search or not own) + ["_prior_encoder"] * own
+        return np.concatenate([self.encode_features(x, name=name) for name in names], 1)
 
     def prior(self, latents, steps):
-        """What each agent would do if it didn't search: `latents` -> actions (N, steps, d, B), by
-        its P^i, which names `prior_steps` of them [D9]; an expert's policy, rolled out."""
+        """What each agent would do without a search: `latents` -> actions (N, steps, d, B), by its
+        P^i, which names `prior_steps` of them [D9]; an expert: its policy, rolled out."""
         if self.has_policy:
             return policy_rollout(self, latents, [F32(0)] * steps).swapaxes(0, 1)
         sizes = self.config
@@ -579,7 +570,7 @@ def perturbed_batch(expert, student, obs, actions, config, rng):
     """What `distill_loss` learns from, of observations (O, B) and the actions (L, A, B, 1) done:
     features (1, F, B), perturbed actions (L, A, B, K), the expert's predictions for them."""
     perturbed, z = perturbed_actions(actions, config, rng), expert.encode(obs)
-    return student.features(obs, z), perturbed, predict(expert, z, perturbed)
+    return student.read(obs), perturbed, predict(expert, z, perturbed)
 
 
 def distill(expert, replay, config, num_agents=None, seed=0):
@@ -860,43 +851,6 @@ def from_dict(config_class, values, where):
         raise UserError(f"{where}: {error}") from None
 
 
-def memory():
-    """Bytes of memory that this machine, or its container, has; infinite where neither tells."""
-    found = [np.inf]
-    with contextlib.suppress(AttributeError, OSError, ValueError):
-        found.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-        found.append(int(Path("/sys/fs/cgroup/memory.max").read_text()))
-    return min(found)
-
-
-LARGE = ("samples", "pi_trajs", "horizon", "batch_size", "noise_samples",
-         "expert_episodes", "buffer_size", "latent_dim", "enc_dim", "mlp_dim")  # memory's drivers
-
-
-def check_memory(numbers, *configs):
-    """UserError if so many float32 don't fit in memory, with the setting of the configs to lower:
-    the one that is the furthest above its default."""
-    _, name, value = max((getattr(config, f.name) / max(1, f.default), f.name,
-                          getattr(config, f.name)) for config in configs
-                         for f in dataclasses.fields(config) if f.name in LARGE)
-    need(4 * numbers <= memory(), f"{name} = {value}: it would take about {4e-9 * numbers:.1f} GB "
-         f"of memory, of {1e-9 * memory():.1f} GB here; lower it")
-
-
-def learning_numbers(config, columns):
-    """About how many numbers Adam, gradients and tapes of a model hold for so many columns."""
-    return sum(agents * (6 * sum(a * b for a, b in zip(widths, widths[1:])) +
-                         3 * columns * sum(widths)) for *_, agents, widths in networks(config))
-
-
-def planning_numbers(sizes, config):
-    """About how many numbers a plan holds: action sequences, and the widest layers of a block."""
-    S, P = config.samples, config.pi_trajs
-    block = S if config.speed == "plain" else S // sample_blocks(sizes, S)
-    return (2 * (S + P) * (config.horizon + 1) * sizes.dim_action +
-            3 * (block + P) * sizes.num_agents * (sizes.latent_dim + 2 * sizes.mlp_dim))
-
-
 # ==== 7. Added to the paper: more states [D8], credit and priors of their own [D9] =====
 
 @dataclasses.dataclass(frozen=True)
@@ -998,16 +952,16 @@ def prior_loss(student, x, targets, lam, grads=None):
 
         mean over B of sum_h lambda^h |P_h^i(e^i) - target_h^i|^2, summed over the agents i
 
-    x (1, F, B): what encoders read; e: `prior_latents` of it; targets (N, L, d, B)."""
+    x (1, F, B): what encoders read; e: its encoding for the priors; targets (N, L, d, B)."""
     tapes, (_, L, _, B) = ([], []), targets.shape
-    e = student.prior_latents(x, tapes[0])
+    e = student.encode_features(x, tapes[0], "_prior_encoder")                 # (N, m, B)
     y = np.tanh(student.forward("_prior", e, tapes[1]))                       # (N, L * d, B)
     error = y.reshape(targets.shape) - targets
     weights = (lam ** np.arange(L) / B).astype(error.dtype)[:, None, None]
     if grads is not None:
         dy = (2 * weights * error).reshape(y.shape)
         de = student.backward("_prior", tapes[1], tanh_backward(dy, y), grads)
-        student.backward("_prior_encoder", tapes[0], de.reshape(1, -1, B), grads)
+        student.encode_backward(de, tapes[0], grads, "_prior_encoder")
     return float((weights * error ** 2).sum())
 
 
@@ -1022,7 +976,7 @@ def taught_batch(expert, student, obs, actions, config, rng):
         perturbed[..., :1] = actions[..., :1]
         predicted = predict(expert, z, perturbed, tapes := defaultdict(list))
         targets = credit(expert, tapes, perturbed, predicted, student.config)
-        features = student.features(obs, z)
+        features = student.read(obs)
     return features, perturbed[:, agent_order(student.config)], targets
 
 
@@ -1108,11 +1062,6 @@ class Distiller:
         prior_steps = (config.horizon + 1) * config.priors
         sizes = dataclasses.replace(student_config(shared, num_agents, config.encoder_input,
                                                    prior_steps), **sizes)
-        copies = config.noise_samples * (config.horizon + 1)  # columns of a state
-        check_memory(learning_numbers(sizes, config.batch_size * copies) + copies * (
-            2 * self.pool_size * (theirs.dim_action + 3) + 24 * PART * theirs.mlp_dim) +
-            config.expert_episodes * EPISODE_STEPS * (theirs.dim_obs + theirs.dim_action),
-            config, sizes)
         with one_thread():
             self.optimizer, self.student = self.create(expert, sizes, seed)
         self._number = None
@@ -1494,7 +1443,6 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
         need(config.prior == "last" or model.has_prior, "the model has no prior for plans to begin "
              "from: it is a student distilled without, or an expert that has no policy; pass "
              "--plan-prior last (evaluate: --prior last)")
-        check_memory(planning_numbers(model.config, config), config, model.config)
         self._parts = split_agents(model.config.num_agents, workers)
         own, *others = ((some_agents(model, part.start, part.stop), config)
                         for part in self._parts)

@@ -164,7 +164,7 @@ class TapDistiller(fac.Distiller):
             latent.append(np.clip(u, -1, 1))
             inputs.append(np.concatenate([s, self.vae.decode(s[0], latent[-1])[None]], 1))
         latent = np.stack(latent).reshape(L, -1, B, K)
-        return student.features(obs, z), latent, [
+        return student.read(obs), latent, [
             y.sum(0) for y in fac.run_heads(expert, np.concatenate(inputs, 2), latent)]
 
 

@@ -31,17 +31,17 @@ class Multitask(fac.WorldModel):
         super().__init__(config, params)
         self.dims = dims
 
-    def encode_features(self, x, tape=None):
+    def encode_features(self, x, tape=None, name="_encoder"):
         obs, task = np.split(x, [self.config.dim_obs - EMBEDDING], 1)
         x = np.concatenate([obs * (self.params[SCALES] @ task), self.params[TASKS] @ task], 1)
-        z = super().encode_features(x, tape)
+        z = super().encode_features(x, tape, name)
         if tape is not None:
             tape.append(task)
         return z
 
-    def encode_backward(self, dz, tape, grads):
+    def encode_backward(self, dz, tape, grads, name="_encoder"):
         task = tape.pop()
-        dx = super().encode_backward(dz, tape, grads)
+        dx = super().encode_backward(dz, tape, grads, name)
         grads[TASKS] += dx[:, -EMBEDDING:] @ task.swapaxes(1, 2)
         return dx
 

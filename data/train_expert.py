@@ -377,10 +377,6 @@ class Training:
         self.args, self.config, self.planning = args, config, planning
         sizes = fac.ModelConfig(dim_obs, dim_action, 1, config.latent_dim, config.enc_dim,
                                 config.mlp_dim)
-        held = min(config.buffer_size, args.steps) * (dim_obs + dim_action + 1)
-        fac.check_memory(held + fac.learning_numbers(
-            sizes, config.batch_size * (config.horizon + 1)), config)
-        fac.check_memory(fac.planning_numbers(sizes, planning), planning, sizes)
         self.learner = make_learner(args, sizes, config)
         self.steps = task_steps(args.task, planning)
         new_buffer = functools.partial(ReplayBuffer, dim_obs, dim_action, config.buffer_size,

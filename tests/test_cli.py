@@ -184,7 +184,7 @@ def configs_of(monkeypatch, *arguments):
 def test_default_settings_are_those_of_the_dataclasses(monkeypatch):
     assert configs_of(monkeypatch, "distill") == (
         fac.DistillConfig(), fac.PlannerConfig(**fac.STUDENT_PLANNING))
-    assert configs_of(monkeypatch, "distill", "--plan-prior", "none")[1:] == (fac.PlannerConfig(),)
+    assert configs_of(monkeypatch, "distill", "--plan-prior", "last")[1:] == (fac.PlannerConfig(),)
     assert configs_of(monkeypatch, "evaluate", "--model", "x") == (fac.PlannerConfig(),)
 
 
@@ -217,7 +217,7 @@ def test_plain_takes_a_preset_that_is_named(monkeypatch):
     for name, flags in (("plain", []), ("paper", ["--preset", "paper"])):
         config, planner = configs_of(monkeypatch, "distill", "--preset", name)
         assert configs_of(monkeypatch, "distill", "--plain", *flags) == (
-            dataclasses.replace(config, reuse=1), dataclasses.replace(planner, returns="plain"))
+            dataclasses.replace(config, reuse=1), dataclasses.replace(planner, speed="plain"))
 
 
 def test_flags_go_before_the_preset(monkeypatch):
@@ -297,7 +297,7 @@ def refused(done, *parts, program="fac_tdmpc_ref.py"):
     (["--noise-std", "nan"], ["noise_std", "nan"]),
     (["--lr", "inf"], ["lr", "finite"]),
     (["--expert-episodes", "1", "--played-share", "0"], ["played_share", "above 0", "not 0.0"]),
-    (["--encoder-input", "observation"], ["no policy", "--plan-prior none"]),
+    (["--encoder-input", "observation"], ["no policy", "--plan-prior last"]),
     (["--held-out", "1"], ["held_out", "at least 0.0001 and at most 0.5"]),
     (["--horizon", "40"], ["replay.npz", "two episodes of at least 41 actions"]),
     (["--kl", "sideways"], ["--kl", "'sideways'", "forward"]),
@@ -432,7 +432,7 @@ def test_distill_prints_json_and_a_table(distilled):
     (["--plan-max-std", "0.3"], 1.0, (0.3, 32, 3)), (["--plan-samples", "8"], 1.0, (1.0, 8, 3)),
     (["--plan-min-std", "1.5", "--plan-max-std", "2"], 1.0, (2.0, 32, 3)),
     (["--preset", "plain"], None, (2.0, 128, 4)),
-    (["--plan-prior", "none"], None, (2.0, 128, 4)),
+    (["--plan-prior", "last"], None, (2.0, 128, 4)),
     (["--plan-elites", "20"], -1.0, (0.15, 20, 2)),  # of many agents, which search with 16 samples
     (["--plan-elites", "20", "--plan-samples", "24"], -1.0, (0.15, 24, 2))])
 def test_who_finds_better_plans_far_away_searches_widely(
@@ -456,7 +456,7 @@ def test_who_finds_better_plans_far_away_searches_widely(
     assert [vars(fac.PlannerConfig(**fac.made_for(header, "student")))] == planned  # as evaluate
     monkeypatch.setattr(fac, "evaluate", lambda model, task, planning, *_: (
         planned.append(planning), {"returns": [0.0], "plan_ms_median": 0.0})[1])
-    fac.main(["evaluate", "--model", str(tmp_path / "out" / "student.npz"), "--prior", "none"])
+    fac.main(["evaluate", "--model", str(tmp_path / "out" / "student.npz"), "--prior", "last"])
     sizes = planned[-1].max_std, planned[-1].samples, planned[-1].iterations, planned[-1].output
     assert sizes == ((*expected, "sampled") if gain is None else (2.0, 128, 4, "sampled"))
     wider = gain and float(gain * (expected[0] < 2))  # than what the flags say

@@ -554,7 +554,7 @@ def test_a_student_s_file_plans_over_what_it_was_distilled_for():
     assert fac.made_for({**header, "distill": None}, "x") == {"discount": 0.9, "horizon": 3}
     assert fac.made_for({}, "x") == {}
     own = {"samples": 7, "horizon": 5, "discount": 0.8}
-    assert fac.made_for({**header, "planner": {**own, "returns": "plain"}}, "x") == own
+    assert fac.made_for({**header, "planner": {**own, "speed": "plain"}}, "x") == own
 
 
 # data_file ----------------------------------------------------------------------------

@@ -382,7 +382,7 @@ def test_a_step_in_halves_is_the_step_of_the_whole(replay, batch):
 
 
 def test_what_plans_gain_is_told_by_the_expert_and_promised_by_the_model(replay):
-    config = fac.PlannerConfig(prior="policy", max_std=0.3, samples=64, iterations=3, pi_trajs=0)
+    config = fac.PlannerConfig(prior="own", max_std=0.3, samples=64, iterations=3, pi_trajs=0)
     obs = replay.observation[:16].T.astype(np.float32)
     with fresh(replay, CONFIG) as distiller:
         expert, student = distiller.expert, distiller.student
@@ -398,7 +398,7 @@ def test_what_plans_gain_is_told_by_the_expert_and_promised_by_the_model(replay)
     lost, promised = fac.plan_gains(expert, student, config, obs)
     assert promised.mean() > 0 and lost.mean() < gain.mean() / 2
     assert not np.array_equal(lost, fac.plan_gains(expert, student, config, obs, 1)[0])
-    still = fac.dataclasses.replace(still, prior="none")  # whose plan is to do nothing
+    still = fac.dataclasses.replace(still, prior="last")  # whose plan is to do nothing
     policy = fac.policy_rollout(expert, z, [np.float32(0)] * 4)[:, 0]
     both = np.stack([np.zeros_like(policy), policy], -1)
     G = fac.horizon_returns(*fac.predict(expert, z, both), config.discount)[-1]

@@ -163,7 +163,7 @@ def test_noise_of_played_episodes_has_another_deviation_in_each(monkeypatch):
     for key in ("_pi.4.weight", "_pi.4.bias"):
         expert.params[key][:] = 0  # so that what is done is the noise
     robot = SimpleNamespace(reset=lambda seed: np.zeros(8), step=lambda action: (np.zeros(8), 0.0))
-    config, seeds = fac.PlannerConfig(prior="policy", iterations=0), list(range(40))
+    config, seeds = fac.PlannerConfig(prior="own", iterations=0), list(range(40))
     done, again, other, still = (fac.play(expert, None, config, of, 0, "", robot, noise)[1]
                                  for of, noise in ((seeds, 0.3), (seeds[::-1], 0.3), (seeds, 0.6),
                                                    (seeds[:2], 0.0)))

@@ -1158,7 +1158,7 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
                 (json.loads(row["returns"]), model, students_own),
                 (json.loads(row["expert_returns"]), expert, own),
                 (json.loads(row["policy_returns"]), expert,
-                 dataclasses.replace(own, prior="policy", iterations=0)),
+                 dataclasses.replace(own, prior="own", iterations=0)),
                 (students.returns(row, "same_search_returns"), expert,
                  dataclasses.replace(students_own, pi_trajs=0))):
             returns = fac.play(who, "reacher-easy", planning, seeds, 0)[2].sum(1)
@@ -1245,7 +1245,7 @@ def test_shares_are_each_agent_s_own():
 def test_shares_are_of_plans_that_start_as_the_model_s_do():
     """Around its policy, with hardly any width: what the policy's rollout is worth."""
     model, obs = random_model(1, policy=True), np.full((8, 1), 0.3, np.float32)
-    config = fac.PlannerConfig(prior="policy", min_std=1e-6, max_std=1e-6, horizon=2)
+    config = fac.PlannerConfig(prior="own", min_std=1e-6, max_std=1e-6, horizon=2)
     plan, z = fac.policy_plan(model, obs, 3, model.config), model.encode(obs)
     worth = fac.h_step_return(model, z, np.concatenate([plan, 0 * plan], -1), config)[0]
     np.testing.assert_allclose(look.shares(model, z, config, obs), worth[:1] - worth[1:], rtol=1e-3)

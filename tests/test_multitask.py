@@ -282,7 +282,7 @@ def short_episodes(monkeypatch):
 def test_evaluate(data, student, short_episodes):
     evaluated = functools.partial(said, "evaluate", "--model", student[0] / "two" / "student.npz",
                                   "--episodes", "2", "--data", data, "--workers", "0")
-    around, alone = evaluated(), evaluated("--prior", "none", "--tasks", "walker-walk")
+    around, alone = evaluated(), evaluated("--prior", "last", "--tasks", "walker-walk")
     assert set(around["tasks"]) == {"reacher-hard", "walker-walk"}
     assert set(alone["tasks"]) == {"walker-walk"}
     found = around["tasks"]["walker-walk"]
@@ -294,7 +294,7 @@ def test_evaluate(data, student, short_episodes):
     model, _ = load(student[0] / "two" / "student.npz")
     expert, header, path = multitask.load_expert("walker-walk", data)
     assert found["policy_returns"] == fac.evaluate(expert, "walker-walk", fac.PlannerConfig(
-        prior="policy", iterations=0), 2, 0, 0)["returns"]
+        prior="own", iterations=0), 2, 0, 0)["returns"]
     assert found["kept"] == fac.return_kept(np.mean(found["returns"]),
                                             np.mean(found["teacher_returns"]))
     for prior, returns in (("policy", found), ("none", alone["tasks"]["walker-walk"])):

@@ -288,7 +288,7 @@ def test_a_plan_of_no_iterations_is_what_the_policy_would_do(monkeypatch):
     expert, obs = random_model(1, policy=True), np.linspace(-1, 1, 8, dtype=np.float32)
     z = expert.encode(obs[:, None])
     for model in (expert, student_of(expert)):
-        config = fac.PlannerConfig(prior="policy", iterations=0)
+        config = fac.PlannerConfig(prior="own", iterations=0)
         assert np.array_equal(fac.Planner(model, config).act(obs), expert.policy(z)[0, :, 0])
         assert not fac.Planner(model, fac.PlannerConfig(iterations=0)).act(obs).any()
 
@@ -298,7 +298,7 @@ def test_a_search_around_the_policy_starts_there_every_time(output):
     """In each agent's own part of the expert's rollout, with the first deviation for width."""
     expert = random_model(1, policy=True)
     student, seen = student_of(expert), []
-    config = fac.PlannerConfig(prior="policy", samples=400, iterations=1, min_std=0.01,
+    config = fac.PlannerConfig(prior="own", samples=400, iterations=1, min_std=0.01,
                                max_std=0.01, horizon=2, output=output)
     planner, obs = fac.Planner(student, config), np.full(8, 0.3, np.float32)
     start = planner.own.fast.start
@@ -315,8 +315,8 @@ def test_a_search_around_the_policy_starts_there_every_time(output):
 def test_a_policy_to_start_from_is_needed():
     for model in (random_model(1), random_model(3), student_of(random_model(1, policy=True),
                                                                expert_mlp_dim=0)):
-        with pytest.raises(fac.UserError, match="no policy of an expert.*--plan-prior none"):
-            fac.Planner(model, fac.PlannerConfig(prior="policy"))
+        with pytest.raises(fac.UserError, match="no policy of an expert.*--plan-prior last"):
+            fac.Planner(model, fac.PlannerConfig(prior="own"))
 
 
 def test_an_observation_of_the_wrong_size_is_refused():
@@ -357,7 +357,7 @@ def shared_memory():
 
 def test_workers_begin_where_the_policy_does():
     student = student_of(random_model(1, policy=True))
-    config = fac.PlannerConfig(samples=32, iterations=2, prior="policy", max_std=0.2)
+    config = fac.PlannerConfig(samples=32, iterations=2, prior="own", max_std=0.2)
     obs, plans = np.random.default_rng(1).standard_normal((3, 8)), []
     for workers in (0, 1, 2):
         with fac.Planner(student, config, 0, workers) as planner:
@@ -727,7 +727,7 @@ def test_cores_are_those_this_process_may_use(monkeypatch):
 @pytest.mark.parametrize("odd", [
     {"samples": 1}, {"elites": 16}, {"elites": 1}, {"iterations": 1}, {"horizon": 0},
     {"inverse_temperature": 1e-9}, {"momentum": 1.0}, {"discount": 0.0}, {"pi_trajs": 1},
-    {"min_std": 2.0}, {"returns": "plain"}])
+    {"min_std": 2.0}, {"speed": "plain"}])
 def test_odd_settings_plan_all_the_same(odd, n, output):
     """Also where all returns are equal, as those of a model without rewards and values."""
     config = fac.PlannerConfig(**{"samples": 16, "iterations": 2, "output": output, **odd})
