@@ -2552,8 +2552,7 @@ def add_command(commands, name, run, help, **extra):
     """A sub-command with --json, which every one has."""
     sub = commands.add_parser(name, help=help, description=help, allow_abbrev=False, **extra)
     sub.set_defaults(run=run)
-    sub.add_argument("--json", action="store_true",
-                     help="print one JSON object as the last line of stdout")
+    sub.add_argument("--json", action="store_true", help="print JSON as the last line of stdout")
     return sub
 
 
@@ -2625,9 +2624,16 @@ def run_command(parser, argv=None):
     if hasattr(sys.stdout, "reconfigure"):  # a terminal that has no ±
         sys.stdout.reconfigure(errors="replace")
     try:
-        result = args.run(args)
-        print(json.dumps(result) + "\n" if args.json else "", end="", flush=True)
-    except (UserError, MemoryError, OSError) as error:
+        with contextlib.ExitStack() as stack:
+            if args.json and argv is None:  # the last line, whatever a robot prints in C, or ending
+                own = os.fdopen(os.dup(1), "w", encoding=sys.stdout.encoding, errors="replace")
+                stack.enter_context(contextlib.redirect_stdout(stack.enter_context(own)))
+                os.dup2(2, 1)
+            result = args.run(args)
+            print(f"\n{json.dumps(result)}\n" if args.json else "", end="", flush=True)
+    except (UserError, MemoryError, OSError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "start new thread" not in str(error):
+            raise  # a mistake of ours; that one is a limit's
         if isinstance(error, OSError) and error.filename:
             error = f"{error.filename}: can't be read or written: {error.strerror}"
         elif isinstance(error, OSError):  # a full stdout's, which would fail again at the end
