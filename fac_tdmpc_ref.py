@@ -2147,9 +2147,12 @@ def train_student(distiller, out, settings, planning, workers):
             if distiller.t:
                 curve, before = header["curve"], float(header["seconds"])
                 np.array(curve, float).reshape(-1, len(CURVE))[-1]  # raises where it is none
+                write_curve(out / "curve.csv", CURVE, curve)  # a kill may have come before it
         except (LookupError, TypeError, ValueError, OverflowError) as error:
             raise UserError(f"{checkpoint}: damaged ({error!r}); delete it to start anew") from None
-    began = saved = time.time()
+    elif not (out / "student.npz").exists():
+        need_none(out, "config.json", "result.json", "curve.csv", "curve.png")
+    began, saved = time.monotonic(), -np.inf
     if not distiller.t and config.expert_episodes:
         distiller.add(*expert_episodes(distiller, settings["task"], planning, workers))
     every, losses = max(1, min(250, config.steps // 8)), []
@@ -2163,17 +2166,17 @@ def train_student(distiller, out, settings, planning, workers):
             q, g = (x.tolist() for x in distiller.ranks(64, planning.discount))
             check_finite("weights are", distiller.optimizer.vector, distiller.t, config.lr)
             check_finite("student's predictions are", q, distiller.t, config.lr)
-            seconds = before + time.time() - began
+            seconds = before + time.monotonic() - began
             curve.append([distiller.t, round(seconds, 2), *means,
                           learning_rate(config, distiller.t - 1), q[0], q[-1], g[-1]])
             bar.set_postfix_str("loss {:.4f} KL reward {:.4f} value {:.4f} rank {:.3f}".format(
                 *means, g[-1]), False)
-            write_curve(out / "curve.csv", CURVE, curve)
-            if time.time() - saved > 30 or distiller.t == config.steps:
+            if time.monotonic() - saved > 30 or distiller.t == config.steps:
                 write_npz(checkpoint, {"kind": "checkpoint", "settings": settings, "curve": curve,
                                        "seconds": seconds}, distiller.state())
-                saved = time.time()
-    return curve, before + time.time() - began, before
+                saved = time.monotonic()
+            write_curve(out / "curve.csv", CURVE, curve)  # which a checkpoint shows to be its
+    return curve, before + time.monotonic() - began, before
 
 
 def same_settings(found, expected, where, group=""):
@@ -2302,7 +2305,7 @@ def record_returns(path, model, config, seed, returns):
 
 def command_distill(args):
     """distill: expert and replay in, student, learning curve, table and JSON out."""
-    began = time.time()
+    began = time.monotonic()
     named = "plain" if args.plain and args.preset == "default" else args.preset
     preset = functools.partial(preset_values, preset=named)
     config = from_args(DistillConfig, args, **{
@@ -2325,8 +2328,9 @@ def command_distill(args):
         obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
         both = (expert, own), (distiller.student, planning)
         result.update(evaluate_both(*both, path, args))
+        write_json(out / "result.json", result)  # if no more can be had, as timing needs processes
         result.update(time_both(*both, obs))
-        result["seconds_total"] = round(result["seconds_total"] + time.time() - began, 1)
+        result.update(seconds_total=round(result["seconds_total"] + time.monotonic() - began, 1))
         write_json(out / "result.json", result)
     report(result, (own, planning))
     return result

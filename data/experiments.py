@@ -141,7 +141,7 @@ def attempt(function, run, home):
         multiprocessing.set_start_method("spawn", force=True)  # loky's can't start a run's workers
         if os.getppid() == home and sys.platform == "linux":  # ends with it
             ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG, SIGKILL
-    began = time.time()
+    began = time.monotonic()
     with fac.one_thread(), contextlib.redirect_stdout(sys.stderr):
         try:
             settings = json.loads(run["settings"])
@@ -151,7 +151,7 @@ def attempt(function, run, home):
             found = list(function(run["task"], int(run["seed"]), run["case"], settings))
             fac.need(all(np.isfinite(v) for row in found for v in row.values()
                          if isinstance(v, float)), f"found {found[-1]}, not finite")
-            found[-1].setdefault("minutes", (time.time() - began) / 60)
+            found[-1].setdefault("minutes", (time.monotonic() - began) / 60)
         except Exception as error:
             return failed(run, error)
     return [{**run, **row, "versions": versions()} for row in found]

@@ -354,7 +354,7 @@ class Run:
     def __init__(self, args, config, learner, workers, before):
         self.args, self.config, self.learner, self.workers = args, config, learner, workers
         self.before = before
-        self.began, self.decisions = time.time(), 0
+        self.began, self.decisions = time.monotonic(), 0
         self.curves = [[] for _ in args.tasks]
         new, (T, E) = learner.torch.zeros, (len(args.tasks), args.envs)
         self.obs_now = new(T, E, learner.dim_obs, device=learner.device)
@@ -364,7 +364,7 @@ class Run:
     @property
     def seconds(self):
         """Since the start."""
-        return time.time() - self.began
+        return time.monotonic() - self.began
 
     def schedule(self):
         """Exploration and learning rate of now."""

@@ -725,14 +725,15 @@ def test_the_same_command_gives_the_same_student(tmp_path, files, distilled, no_
 
 # going on after a crash ---------------------------------------------------------------
 
-# `distill` with a checkpoint after every second row of the curve (the clock strides), a made-up
+# `distill` with a checkpoint after every third row of the curve (the clock strides), a made-up
 # evaluation, and a SIGKILL before step argv[1]: nothing gets to clean up.
 DRIVER = f"""
 import itertools, os, signal, sys, time, types
 sys.path.insert(0, {str(ROOT)!r})
 import fac_tdmpc_ref as fac
 clock = itertools.count()
-fac.time = types.SimpleNamespace(time=lambda: 13.0 * next(clock), perf_counter=time.perf_counter)
+fac.time = types.SimpleNamespace(monotonic=lambda: 7.0 * next(clock),
+                                 perf_counter=time.perf_counter)
 fac.evaluate = lambda *_, **__: {{"returns": [1.0]}}
 stop, step = int(sys.argv[1]), fac.Distiller.step
 def step_or_die(self):
@@ -759,7 +760,7 @@ def killed(tmp_path, files, no_plots):
     assert distill(stop=3).returncode == -signal.SIGKILL
     assert sorted(os.listdir(tmp_path / "out")) == ["checkpoint.npz", "curve.csv"]
     with np.load(tmp_path / "out" / "checkpoint.npz") as file:
-        assert file["step"] == 2  # so that the third step is taken twice
+        assert file["step"] == 1  # so that two steps are taken twice
     return tmp_path / "out", distill
 
 
@@ -1135,6 +1136,12 @@ def test_continuous_integration_runs_the_readme_s_test_command():
                 if line.endswith("pytest tests")]
     assert len(commands) == 1
     assert commands[0] in (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+
+
+def test_durations_are_of_a_clock_that_nobody_sets():
+    """A checkpoint of one that was set back would count as damaged."""
+    for path in (*ROOT.glob("*.py"), *(ROOT / "data").glob("*.py")):
+        assert not re.search(r"\btime\.time\(|\bdatetime\b", path.read_text("utf-8")), path
 
 
 def test_mujoco_and_dm_control_are_pinned_as_a_pair():
