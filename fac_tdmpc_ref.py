@@ -1623,11 +1623,11 @@ def import_dm_control(render=False):
         from dm_control import suite
         from dm_control.rl import control
         from dm_control.suite import reacher
-    except (ImportError, RuntimeError, AttributeError) as error:
-        raise UserError(
-            f"dm_control does not import ({error}); it needs mujoco==3.17.0 beside "
-            f"dm-control==1.0.50, and MUJOCO_GL unset or one of egl, osmesa, disable "
-            f"(it is {backend!r})") from error
+        reacher.Physics.from_xml_string("<mujoco/>")  # MuJoCo's of other versions import, and fail
+    except Exception as error:
+        raise UserError(f"dm_control does not import ({error}); it needs mujoco==3.17.0 beside "
+                        f"dm-control==1.0.50, and MUJOCO_GL unset or one of egl, osmesa, disable "
+                        f"(it is {backend!r})") from error
     finally:
         if backend is None:
             os.environ.pop("MUJOCO_GL", None)
