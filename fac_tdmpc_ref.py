@@ -2190,6 +2190,12 @@ def same_settings(found, expected, where, group=""):
                  f"{ours}, found {theirs}); choose another folder (--out), or empty it")
 
 
+def need_none(folder, *names):
+    """UserError for the first of these files in a folder: a run that isn't its would replace it."""
+    for path in filter(Path.exists, (Path(folder, name) for name in names)):
+        raise UserError(f"{path}: not this run's, which would replace it; choose another --out")
+
+
 def write_curve(path, columns, rows):
     """A learning curve as CSV."""
     with atomic_file(path, "w", newline="") as file:
@@ -2365,9 +2371,6 @@ def distil_and_save(distiller, args, planning, header, out):
     if (path := out / "student.npz").exists():  # a run that this one would replace
         before, _ = read_npz(path, ("student",))
         same_settings({key: before.get(key) for key in settings}, settings, path)
-    elif not (out / "checkpoint.npz").exists() and (path := next(out.glob("[cr]*.json"), None)):
-        # config.json or result.json
-        raise UserError(f"{path}: not this run's, which would replace it; choose another --out")
     print(f"{args.task}: {student.config.num_agents} agents, {len(distiller.optimizer.vector):,} "
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)

@@ -325,8 +325,8 @@ def train(args):
     torch.backends.cuda.matmul.allow_tf32 = True
     torch.manual_seed(args.seed)
     before = [started(*of) for of in zip(args.start, args.tasks, sizes)]
-    held = next(Path(args.out).glob("*/expert.npz"), None)
-    fac.need(not held, f"{held}: another run's; choose another --out")
+    for folder in (args.out, *Path(args.out).glob("*/")):
+        fac.need_none(folder, "expert.npz", "replay.npz", "curve.csv")
     models = [before[i][0] if i < len(before) else fac.WorldModel.create(
         size, fac.stream(args.seed, "expert", i), policy=True) for i, size in enumerate(sizes)]
     episodes = max(1, config.buffer_size // fac.EPISODE_STEPS // args.envs) * args.envs
@@ -454,19 +454,18 @@ class Run:
             try:
                 # as float16: half of the room
                 fac.save_model(folder / "expert.npz", model, {"kind": "expert", **about}, True)
+                episodes = ReplayBuffer(model.config.dim_obs, model.config.dim_action,
+                                        count * fac.EPISODE_STEPS)
+                for j in np.arange(count) * held // count:
+                    obs, action, reward = (x[i, j].cpu().numpy() for x in (
+                        learner.obs, learner.action, learner.reward))
+                    episodes.add(obs[:, :model.config.dim_obs],
+                                 action[:, :model.config.dim_action], reward)
+                episodes.write(folder / "replay.npz", about)
+                fac.write_curve(folder / "curve.csv", CURVE, curve)
             except fac.UserError as error:  # one task's failure is not the others'
                 print(error, file=sys.stderr)
                 failed += 1
-                continue
-            episodes = ReplayBuffer(model.config.dim_obs, model.config.dim_action,
-                                    count * fac.EPISODE_STEPS)
-            for j in np.arange(count) * held // count:
-                obs, action, reward = (x[i, j].cpu().numpy() for x in (
-                    learner.obs, learner.action, learner.reward))
-                episodes.add(obs[:, :model.config.dim_obs], action[:, :model.config.dim_action],
-                             reward)
-            episodes.write(folder / "replay.npz", about)
-            fac.write_curve(folder / "curve.csv", CURVE, curve)
         return failed
 
 

@@ -859,7 +859,7 @@ def test_a_finished_run_is_not_replaced_by_one_with_other_settings(distilled, fi
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
-@pytest.mark.parametrize("name", ["config.json", "result.json"])
+@pytest.mark.parametrize("name", ["config.json", "result.json", "curve.csv", "curve.png"])
 def test_another_program_s_files_are_not_replaced(tmp_path, files, capsys, name):
     (tmp_path / name).write_text("an hour's work")
     assert fac.main([str(a) for a in distill_arguments(files, "--out", tmp_path)]) == 2
