@@ -1533,20 +1533,21 @@ class Workers(contextlib.AbstractContextManager):
              "multiprocessing.Pool's, and joblib's can't start workers: pass workers=0")
         if getattr(main := sys.modules["__main__"], "__file__", "") == "<stdin>":
             del main.__file__  # or children look for it
-        for _ in range(count):
-            here, there = context.Pipe()
-            process = context.Process(target=_run_worker, args=(target, there), daemon=True)
-            resource_tracker.ensure_running()  # or `start` does it, which unblocks SIGINT
-            mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a child inherits it
-            try:
+        try:
+            for _ in range(count):
+                here, there = context.Pipe()
+                process = context.Process(target=_run_worker, args=(target, there), daemon=True)
+                resource_tracker.ensure_running()  # or `start` does it, which unblocks SIGINT
+                signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a child inherits it
                 process.start()
-            except (AttributeError, pickle.PicklingError) as error:  # a debugger's, a profiler's
-                raise UserError("no process can be started beside one that a debugger or profiler "
-                                f"runs ({error}): run it without, or pass workers=0") from None
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-            there.close()
-            self._members.append((process, here))
+                there.close()
+                self._members.append((process, here))
+        except (AttributeError, pickle.PicklingError, OSError) as error:
+            self.close()
+            raise UserError(f"no process can be started ({error}): pass workers=0 (--workers 0), "
+                            "use no debugger or profiler, or raise a limit (ulimit -a)") from None
+        finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
     def send_all(self, messages):
         """Send one of the messages to each worker, in their order."""

@@ -2,14 +2,18 @@
 
 import csv
 import dataclasses
+import errno
 import importlib.util
 import json
+import multiprocessing.resource_tracker
 import os
 import re
 import signal
 import subprocess
 import sys
+import threading
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -518,6 +522,46 @@ def test_a_pool_s_process_times_itself_alone(monkeypatch):
     found = fac.time_both((random_model(1), planning), (random_model(), planning), np.zeros(8))
     assert found["plan_workers"] == 0
     assert found["plan_ms_student"] == found["plan_ms_student_in_process"] > 0
+
+
+def no_more(*_, **__):
+    raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+
+@pytest.mark.parametrize("what", ["multiprocessing.util.spawnv_passfds", "os.pipe",
+                                  "multiprocessing.connection.Pipe"])
+def test_where_no_process_can_be_started_none_is_needed(tmp_path, files, capsys, monkeypatch, what):
+    """At a limit of processes or of open files: --workers 0 asks for none."""
+    monkeypatch.setattr(fac, "cores", lambda: 2)
+    monkeypatch.setattr(multiprocessing.resource_tracker, "ensure_running", lambda: None)
+    monkeypatch.setattr(what, no_more)
+    arguments = [*map(str, distill_arguments(files, "--out", tmp_path / "out", "--workers"))]
+    assert fac.main([*arguments, "2"]) == 2
+    assert "no process can be started" in (line := capsys.readouterr().err.splitlines()[-1])
+    assert "--workers 0" in line and "limit" in line
+    assert fac.main([*arguments, "0"]) == 0
+    assert json.loads((tmp_path / "out" / "result.json").read_text())["plan_workers"] == 0
+
+
+def test_where_no_thread_can_be_started_it_is_said_in_a_line(tmp_path, files, capsys, monkeypatch):
+    def refuse(*_, **__):
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    arguments = distill_arguments(files, "--out", tmp_path / "out", "--workers", "0")
+    assert fac.main([*map(str, arguments)]) == 2
+    assert "error: can't start new thread" in capsys.readouterr().err.splitlines()[-1]
+    monkeypatch.undo()
+    monkeypatch.setattr(fac.Distiller, "step", lambda _: {}["a mistake"])
+    with pytest.raises(KeyError):
+        fac.main([*map(str, arguments)])
+
+
+def test_returns_are_on_disk_before_anything_is_timed(tmp_path, files, capsys, monkeypatch):
+    monkeypatch.setattr(fac, "time_both", no_more)
+    out = tmp_path / "out"
+    assert fac.main([*map(str, distill_arguments(files, "--out", out, "--workers", "0"))]) == 2
+    assert len(json.loads((out / "result.json").read_text())["student_returns"]) == 1
 
 
 def test_timings_take_turns_and_count_the_second_call_of_each(monkeypatch):
