@@ -440,7 +440,6 @@ class Run:
         count = min(args.replay, held)
         for i, (task, curve) in enumerate(zip(args.tasks, self.curves)):
             folder = Path(out) / (task if args.tasks.count(task) == 1 else f"{task}-{i}")
-            folder.mkdir(parents=True, exist_ok=True)
             model = learner.expert(i)
             about = {"task": task, "seed": args.seed, "decisions": self.decisions,
                      "updates": learner.updates, "action_repeat": fac.ACTION_REPEAT,

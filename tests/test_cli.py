@@ -1154,6 +1154,40 @@ def test_a_record_counts_for_its_own_weights_planner_and_episodes_only(tmp_path)
     assert not found
 
 
+def test_jobs_of_an_array_record_all_their_seeds(tmp_path):
+    """At the same time, and in the program that has the folder."""
+    path, about = tmp_path / "expert.npz", (random_model(), fac.PlannerConfig())
+    path.touch()
+    with fac.locked(tmp_path), ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda seed: fac.record_returns(path, *about, seed, [float(seed)]),
+                      range(40)))
+    assert len(fac.read_records(path)) == 40
+
+
+@pytest.mark.parametrize("name, recorded", [(250 * "n", True), (83 * "\u8d70", True),
+                                            (251 * "n", False)])
+def test_a_record_beside_a_long_name_is_kept_or_refused_before_the_episodes(
+        tmp_path, capsys, monkeypatch, name, recorded):
+    write_expert(tmp_path / "expert.npz")
+    path = (tmp_path / "expert.npz").rename(tmp_path / f"{name}.npz")
+    monkeypatch.setattr(fac, "evaluate", lambda *_: {"returns": [7.0], "plan_ms_median": 1.0})
+    flags = ["evaluate", "--model", str(path), "--record"]
+    assert fac.main(flags) == (0 if recorded else 2)
+    out, err = capsys.readouterr()
+    assert ("reacher-hard" in out) == recorded and ("File name too long" in err) == (not recorded)
+    assert [returns for returns, _ in fac.read_records(path).values()] == [[7.0]] * recorded
+
+
+def test_returns_that_cannot_be_recorded_are_told(files, capsys, monkeypatch):
+    def full(*_):
+        raise fac.UserError("full")
+
+    monkeypatch.setattr(fac, "evaluate", lambda *_: {"returns": [7.0], "plan_ms_median": 1.0})
+    monkeypatch.setattr(fac, "record_returns", full)
+    assert fac.main(["evaluate", "--model", str(files / "expert.npz"), "--record"]) == 2
+    assert "7 \u00b1 0" in capsys.readouterr().out
+
+
 def test_a_record_of_other_versions_gives_way_to_a_shorter_one_of_these(tmp_path):
     path, about = tmp_path / "expert.npz", (random_model(), fac.PlannerConfig(), 5)
     path.with_suffix(".json").write_text(json.dumps({fac.record_key(*about): {
