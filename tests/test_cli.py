@@ -1210,10 +1210,22 @@ def test_a_spoilt_record_is_named(tmp_path, text):
 
 
 def test_continuous_integration_runs_the_readme_s_test_command():
-    commands = [line.strip() for line in (ROOT / ".ci" / "run").read_text().splitlines()
-                if line.endswith("pytest tests")]
-    assert len(commands) == 1
-    assert commands[0] in (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    """In an environment that holds nothing else: what it installs for more comes later."""
+    lines = (ROOT / ".ci" / "run").read_text().splitlines()
+    (at,) = [i for i, line in enumerate(lines) if line.endswith("pytest tests")]
+    assert lines[at] in (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert not [line for line in lines[:at] if re.search(r"\.venv/bin/pip", line)]
+
+
+def test_the_readme_s_tests_skip_what_needs_pytorch_or_dask_alone():
+    """Of what libraries lack: its extra brings all others."""
+    project = (ROOT / "pyproject.toml").read_text()
+    brought = set(re.findall(r"[\w-]+", " ".join(re.findall(
+        r"^(?:test|experiments) = \[(.*)\]$", project, re.M))))
+    by = {"PIL": "matplotlib", "sklearn": "scikit-learn", "imageio_ffmpeg": "ffmpeg"}
+    for path in (ROOT / "tests").glob("test_*.py"):
+        for name in re.findall(r'importorskip\(\s*"(\w+)', path.read_text("utf-8")):
+            assert by.get(name, name) in brought | {"torch", "distributed"}, (path, name)
 
 
 def test_durations_are_of_a_clock_that_nobody_sets():

@@ -835,6 +835,7 @@ def test_a_seed_that_lacks_runs_is_left_out(tmp_path, capsys):
 
 
 def test_negative_returns_are_drawn(tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
     drawn = []
     monkeypatch.setattr(fac, "save_figure", lambda path, figure: drawn.extend(figure.axes))
     for values in ([-1200.0, -250.0], [0.0, 900.0]):
