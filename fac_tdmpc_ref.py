@@ -727,7 +727,6 @@ import os
 import pickle
 import signal
 import sys
-import tempfile
 import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
@@ -1264,8 +1263,7 @@ def rank_results(distiller, states, discount):
 # ---- Plans: `Returns` computes h_step_return.
 
 def homogeneous(params, *layers):
-    """Layers of one size as matrices on inputs whose last row is 1, (N, layers, out + 1, in + 1):
-    [[W, b], [0, 1]] each."""
+    """Layers of one size as [[W, b], [0, 1]], on x that ends in 1: (N, layers, out + 1, in + 1)."""
     W, b = (np.stack([params[f"{layer}.{part}"] for layer in layers], 1)
             for part in ("weight", "bias"))
     return np.block([[W, b], [np.zeros_like(W[..., :1, :]), np.ones_like(b[..., :1, :])]])
@@ -1340,8 +1338,7 @@ class Returns:
 
     def _hidden(self, pair, h, x):
         """Both hidden layers of a pair of networks (0: dynamics and reward, 1: the two Q)."""
-        y = (self.first[pair] @ x if h else
-             self.first_at_start[pair] @ x[:, self.sizes.latent_dim:])
+        y = self.first[pair] @ x if h else self.first_at_start[pair] @ x[:, self.sizes.latent_dim:]
         y = self._norm_tanh(y) if pair else elu(y)
         after = self.second[pair] @ y.reshape(len(y), 2, -1, y.shape[2])
         return elu(after.reshape(y.shape))
@@ -1413,8 +1410,7 @@ NO_ARRAY = TypeError, ValueError, RuntimeError  # of what NumPy can't take; the 
 
 
 def checked(values, shape, what, dtype=F32):
-    """A copy of values of this shape: a robot may use its array again. UserError: of another one,
-    not finite."""
+    """A finite copy, of this shape, of values: a robot may use its array again. UserError: none."""
     try:
         with np.errstate(all="ignore"):  # what is too large is infinite
             found = np.array(values, dtype)
@@ -1511,20 +1507,21 @@ class Workers(contextlib.AbstractContextManager):
              "multiprocessing.Pool's, and joblib's can't start workers: pass workers=0")
         if getattr(main := sys.modules["__main__"], "__file__", "") == "<stdin>":
             del main.__file__  # or children look for it
-        for _ in range(count):
-            here, there = context.Pipe()
-            process = context.Process(target=_run_worker, args=(target, there), daemon=True)
-            resource_tracker.ensure_running()  # or `start` does it, which unblocks SIGINT
-            mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a child inherits it
-            try:
+        try:
+            for _ in range(count):
+                here, there = context.Pipe()
+                process = context.Process(target=_run_worker, args=(target, there), daemon=True)
+                resource_tracker.ensure_running()  # or `start` does it, which unblocks SIGINT
+                signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a child inherits it
                 process.start()
-            except (AttributeError, pickle.PicklingError) as error:  # a debugger's, a profiler's
-                raise UserError("no process can be started beside one that a debugger or profiler "
-                                f"runs ({error}): run it without, or pass workers=0") from None
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-            there.close()
-            self._members.append((process, here))
+                there.close()
+                self._members.append((process, here))
+        except (AttributeError, pickle.PicklingError, OSError) as error:
+            self.close()
+            raise UserError(f"no process can be started ({error}): pass workers=0 (--workers 0), "
+                            "use no debugger or profiler, or raise a limit (ulimit -a)") from None
+        finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
     def send_all(self, messages):
         """Send one of the messages to each worker, in their order."""
@@ -1579,13 +1576,11 @@ def _run_worker(target, connection):
 # ==== 10. Environments (appendix B.1) =================================================
 
 # dm_control's domain and task: (dim O, dim A) of Figure 3
-TASKS = {
-    "reacher-easy": (8, 3), "reacher-hard": (8, 3), "hopper-hop": (15, 4), "fish-swim": (24, 5),
-    "cheetah-run": (17, 6), "walker-walk": (24, 6), "walker-run": (24, 6),
-    "quadruped-walk": (78, 12), "quadruped-run": (78, 12),
-    "humanoid-stand": (67, 21), "humanoid-walk": (67, 21)}
-TASK_NAMES = (f"{', '.join(TASKS)}, another DOMAIN-TASK of dm_control's suite, "
-              "or gym:ID of Gymnasium")
+TASKS = {"reacher-easy": (8, 3), "reacher-hard": (8, 3), "hopper-hop": (15, 4),
+         "fish-swim": (24, 5), "cheetah-run": (17, 6), "walker-walk": (24, 6),
+         "walker-run": (24, 6), "quadruped-walk": (78, 12), "quadruped-run": (78, 12),
+         "humanoid-stand": (67, 21), "humanoid-walk": (67, 21)}
+TASK_NAMES = f"{', '.join(TASKS)}, another DOMAIN-TASK of dm_control's suite, Gymnasium's gym:ID"
 REACHER_TARGET = {"easy": 0.05, "hard": 0.015}  # radius of the target, metres
 REACHER = DATA / "reacher.xml"  # three links; dm_control's has two
 
@@ -1601,11 +1596,11 @@ def import_dm_control(render=False):
         from dm_control import suite
         from dm_control.rl import control
         from dm_control.suite import reacher
-    except (ImportError, RuntimeError, AttributeError) as error:
-        raise UserError(
-            f"dm_control does not import ({error}); it needs mujoco==3.17.0 beside "
-            f"dm-control==1.0.50, and MUJOCO_GL unset or one of egl, osmesa, disable "
-            f"(it is {backend!r})") from error
+        reacher.Physics.from_xml_string("<mujoco/>")  # MuJoCo's of other versions import, and fail
+    except Exception as error:
+        raise UserError(f"dm_control does not import ({error}); it needs mujoco==3.17.0 beside "
+                        f"dm-control==1.0.50, and MUJOCO_GL unset or one of egl, osmesa, disable "
+                        f"(it is {backend!r})") from error
     finally:
         if backend is None:
             os.environ.pop("MUJOCO_GL", None)
@@ -1746,9 +1741,8 @@ def suite_sizes(task):
     none, or its episodes can't be played."""
     suite, *_ = import_dm_control()
     known = {"-".join(names): names for names in suite.ALL_TASKS}
-    near = difflib.get_close_matches(task, [*TASKS, *known], n=1, cutoff=0)
-    need(task in known,
-         f"unknown task {task!r}; did you mean {near[0]!r}? Known tasks: {TASK_NAMES}")
+    (near,) = difflib.get_close_matches(task, [*TASKS, *known], n=1, cutoff=0)
+    need(task in known, f"unknown task {task!r}; did you mean {near!r}? Known tasks: {TASK_NAMES}")
     try:
         env = suite.load(*known[task])
         env.reset()
@@ -1756,8 +1750,7 @@ def suite_sizes(task):
         raise UserError(f"{task}: dm_control can't play it here ({error}); MUJOCO_GL=egl or osmesa "
                         "may help") from None
     steps = env._step_limit  # it has no public name
-    need(steps == CONTROL_STEPS, f"{task}: its episodes have {steps} control steps; expected "
-         f"{CONTROL_STEPS}")
+    need(steps == CONTROL_STEPS, f"{task}: has {steps} control steps; expected {CONTROL_STEPS}")
     spec = env.observation_spec().values()
     return sum(int(np.prod(s.shape)) for s in spec), int(np.prod(env.action_spec().shape))
 
@@ -1783,8 +1776,8 @@ MADE = ("files are made by distill, data/train_expert.py and, of others' checkpo
 
 @contextlib.contextmanager
 def atomic_file(path, mode="wb", **options):
-    """A file that appears under its name only when it is complete; UserError if it can't."""
-    path, temporary = Path(path), Path(f"{Path(path)}{os.urandom(4).hex()}.tmp")
+    """A file that appears under its name, of any length, when it is complete; UserError: can't."""
+    temporary = (path := Path(path)).parent / f"{path.name[:40]}{os.urandom(4).hex()}.tmp"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(temporary, mode.replace("w", "x"), **options) as file:  # readable as umask says
@@ -1798,29 +1791,29 @@ def atomic_file(path, mode="wb", **options):
 
 
 def check_writable(path):
-    """UserError now, not after hours of work, if no file can be made beside this path."""
-    try:
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=Path(path).parent).close()
-    except OSError as error:
-        raise UserError(f"{path}: can't be written: {error.strerror or error}") from error
+    """UserError now, not after hours of work, if no file of this name can be made there."""
+    with contextlib.suppress(EOFError), atomic_file(path):
+        Path(path).exists()  # raises where the name is too long
+        raise EOFError  # so that none gets that name
 
 
 @contextlib.contextmanager
-def locked(folder):
-    """Make a folder and keep other runs out of it; UserError where one is in it. The lock ends with
-    the process, however that ends; where the system or the folder's disk has none, there is none.
-    """
-    Path(folder).mkdir(parents=True, exist_ok=True)
-    check_writable(Path(folder) / "...")
+def locked(path, folder=True, wait=False):
+    """Keep other runs out of a folder, which is made, or of a file; UserError where one is in it,
+    or `wait` for its end. The lock ends with the process, however that ends; where the system or
+    the disk has none, there is none."""
+    if folder:
+        Path(path).mkdir(parents=True, exist_ok=True)
+        check_writable(Path(path, "..."))
     with contextlib.ExitStack() as stack:
         try:
             import fcntl
-            stack.callback(os.close, handle := os.open(folder, os.O_RDONLY))
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            mode = os.O_RDONLY if folder or not os.access(path, os.W_OK) else os.O_RDWR  # for NFS
+            stack.callback(os.close, handle := os.open(path, mode))
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError:
-            raise UserError(f"{folder}: another run is writing into it; wait for its end, or "
-                            "choose another --out") from None
+            raise UserError(f"{path}: another run is writing into it; wait for its end, or choose "
+                            "another --out") from None
         except (ImportError, OSError):
             pass
         yield
@@ -1843,13 +1836,11 @@ def read_npz(path, kinds):
     except Exception as error:  # a damaged file can raise nearly anything
         reason = " ".join(str(error).split()).split(". ")[0]  # NumPy advises to load it unsafely
         raise UserError(f"{path}: not a readable .npz file ({reason}); {MADE}") from None
-    try:
+    header = None
+    with contextlib.suppress(KeyError, ValueError, RecursionError):
         header = json.loads(arrays.pop("header").tobytes())
-        if not isinstance(header, dict):
-            raise ValueError
-    except (KeyError, ValueError, RecursionError):
-        raise UserError(f"{path}: header: expected a JSON entry of this name, found none; {MADE}"
-                        ) from None
+    need(isinstance(header, dict), f"{path}: header: expected a JSON entry of this name, found "
+         f"none; {MADE}")
     need(header.get("format") == FORMAT, f"{path}: header: format: expected {FORMAT!r}, found "
          f"{header.get('format')!r}; a newer version's file needs that version of this project")
     need(header.get("kind") in kinds, f"{path}: header: kind: expected {' or '.join(kinds)!r}, "
@@ -1902,8 +1893,7 @@ def made_for(header, where):
     for group, names in (("training", ("discount", "horizon")), ("distill", ("horizon",)),
                          ("planner", ("discount", "horizon", *SEARCH))):
         settings = header.get(group) or {}
-        need(isinstance(settings, dict), f"{there}: {group}: expected settings, found "
-             f"{settings!r}")
+        need(isinstance(settings, dict), f"{there}: {group}: expected settings, found {settings!r}")
         settings = {name: settings[name] for name in names if name in settings}
         from_dict(PlannerConfig, settings, f"{there}: {group}")
         found.update(settings)
@@ -2238,9 +2228,12 @@ def train_student(distiller, out, settings, planning, workers):
             if distiller.t:
                 curve, before = header["curve"], float(header["seconds"])
                 np.array(curve, float).reshape(-1, len(CURVE))[-1]  # raises where it is none
+                write_curve(out / "curve.csv", CURVE, curve)  # a kill may have come before it
         except (LookupError, TypeError, ValueError, OverflowError) as error:
             raise UserError(f"{checkpoint}: damaged ({error!r}); delete it to start anew") from None
-    began = saved = time.time()
+    elif not (out / "student.npz").exists():
+        need_none(out, "config.json", "result.json", "curve.csv", "curve.png")
+    began, saved = time.monotonic(), -np.inf
     if not distiller.t and config.expert_episodes:
         distiller.add(*expert_episodes(distiller, settings["task"], planning, workers))
     every, losses = max(1, min(250, config.steps // 8)), []
@@ -2254,17 +2247,17 @@ def train_student(distiller, out, settings, planning, workers):
             q, g = (x.tolist() for x in distiller.ranks(64, planning.discount))
             check_finite("weights are", distiller.optimizer.vector, distiller.t, config.lr)
             check_finite("student's predictions are", q, distiller.t, config.lr)
-            seconds = before + time.time() - began
+            seconds = before + time.monotonic() - began
             curve.append([distiller.t, round(seconds, 2), *means,
                           learning_rate(config, distiller.t - 1), q[0], q[-1], g[-1]])
             bar.set_postfix_str("loss {:.4f} KL reward {:.4f} value {:.4f} rank {:.3f}".format(
                 *means, g[-1]), False)
-            write_curve(out / "curve.csv", CURVE, curve)
-            if time.time() - saved > 30 or distiller.t == config.steps:
+            if time.monotonic() - saved > 30 or distiller.t == config.steps:
                 write_npz(checkpoint, {"kind": "checkpoint", "settings": settings, "curve": curve,
                                        "seconds": seconds}, distiller.state())
-                saved = time.time()
-    return curve, before + time.time() - began, before
+                saved = time.monotonic()
+            write_curve(out / "curve.csv", CURVE, curve)  # which a checkpoint shows to be its
+    return curve, before + time.monotonic() - began, before
 
 
 def same_settings(found, expected, where, group=""):
@@ -2276,6 +2269,12 @@ def same_settings(found, expected, where, group=""):
         else:
             need(theirs == ours, f"{where}: a run with other settings ({group}{key}: expected "
                  f"{ours}, found {theirs}); choose another folder (--out), or empty it")
+
+
+def need_none(folder, *names):
+    """UserError for the first of these files in a folder: a run that isn't its would replace it."""
+    for path in filter(Path.exists, (Path(folder, name) for name in names)):
+        raise UserError(f"{path}: not this run's, which would replace it; choose another --out")
 
 
 def write_curve(path, columns, rows):
@@ -2352,8 +2351,8 @@ def draw_curve(path, curve, title):
 def read_records(path):
     """{`record_key`: (returns, the `software` they are of)} of the .json beside a model's file."""
     path = Path(path).with_suffix(".json")
-    try:
-        records = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    try:  # a name that is too long for a file is no file's
+        records = json.loads(path.read_text(encoding="utf-8")) if os.path.exists(path) else {}
         return {key: ([float(r) for r in about["returns"]], dict(about["versions"]))
                 for key, about in records.items()}
     except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
@@ -2362,10 +2361,9 @@ def read_records(path):
 
 def record_key(model, config, seed):
     """What recorded returns depend on: weights, planner and the episodes' seed."""
-    more = [f", {f.name.replace('_', ' ')} {value}" for f in dataclasses.fields(config)
-            if not f.repr and (value := getattr(config, f.name)) != f.default]
-    return (f"weights {checksum(model.params.values())}, evaluation seed {seed}, {config}" +
-            "".join(more))
+    more = "".join(f", {f.name.replace('_', ' ')} {value}" for f in dataclasses.fields(config)
+                   if not f.repr and (value := getattr(config, f.name)) != f.default)
+    return f"weights {checksum(model.params.values())}, evaluation seed {seed}, {config}{more}"
 
 
 def software():
@@ -2383,17 +2381,18 @@ def recorded_returns(path, model, task, config, seed):
 
 def record_returns(path, model, config, seed, returns):
     """Keep `evaluate`'s returns beside the model's file, unless it has more of these versions."""
-    records, key = read_records(path), record_key(model, config, seed)
-    before, of = records.get(key, ([], {}))
-    if len(returns) >= len(before) or of != software():
-        records[key] = returns, software()
-        write_json(Path(path).with_suffix(".json"), {
-            key: {"returns": values, "versions": of} for key, (values, of) in records.items()})
+    with locked(path, folder=False, wait=True):  # jobs of an array record at the same time
+        records, key = read_records(path), record_key(model, config, seed)
+        before, of = records.get(key, ([], {}))
+        if len(returns) >= len(before) or of != software():
+            records[key] = returns, software()
+            write_json(Path(path).with_suffix(".json"), {
+                key: {"returns": values, "versions": of} for key, (values, of) in records.items()})
 
 
 def command_distill(args):
     """distill: expert and replay in, student, learning curve, table and JSON out."""
-    began = time.time()
+    began = time.monotonic()
     named = "plain" if args.plain and args.preset == "default" else args.preset
     preset = functools.partial(preset_values, preset=named)
     config = from_args(DistillConfig, args, **{
@@ -2416,8 +2415,9 @@ def command_distill(args):
         obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
         both = (expert, own), (distiller.student, planning)
         result.update(evaluate_both(*both, path, args))
+        write_json(out / "result.json", result)  # if no more can be had, as timing needs processes
         result.update(time_both(*both, obs))
-        result["seconds_total"] = round(result["seconds_total"] + time.time() - began, 1)
+        result.update(seconds_total=round(result["seconds_total"] + time.monotonic() - began, 1))
         write_json(out / "result.json", result)
     report(result, (own, planning))
     return result
@@ -2459,9 +2459,6 @@ def distil_and_save(distiller, args, planning, header, out):
         model, finished = load_model(path, ["student"])
         same_settings({key: finished.get(key) for key in settings}, settings, path)
         student.params.update(prior_weights(model))
-    elif not (out / "checkpoint.npz").exists() and (path := next(out.glob("[cr]*.json"), None)):
-        # config.json or result.json
-        raise UserError(f"{path}: not this run's, which would replace it; choose another --out")
     print(f"{args.task}: {student.config.num_agents} agents, {len(distiller.optimizer.vector):,} "
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
@@ -2624,15 +2621,15 @@ def command_evaluate(args):
          f"{task!r} to record its returns, found {header.get('task')!r}")
     if args.record:
         read_records(args.model)  # which it adds to: what is damaged is missed now
-        check_writable(args.model)
+        check_writable(Path(args.model).with_suffix(".json"))
     found = evaluate(model, task, planning, args.episodes, args.seed, args.workers)
     returns, ms = found["returns"], found["plan_ms_median"]
-    if args.record:
-        record_returns(args.model, model, planning, args.seed, returns)
     mean, std = float(np.mean(returns)), float(np.std(returns))
     print_table([("task", "episodes", "return", "min", "max", "ms a decision"),
                  (task, str(args.episodes), f"{mean:.0f} ± {std:.0f}", f"{min(returns):.0f}",
                   f"{max(returns):.0f}", f"{ms:.1f}")])
+    if args.record:  # now that they are told
+        record_returns(args.model, model, planning, args.seed, returns)
     return {"return_mean": mean, "return_std": std, **found, "episodes": args.episodes,
             "task": task, "seed": args.seed}
 
@@ -2645,11 +2642,10 @@ def add_config(parser, config_class, title=None, prefix="", skip=(), **defaults)
             continue
         default, paper = defaults.get(f.name, f.default), f.metadata.get("paper", f.default)
         shown = f"{default}" if paper == default else f"{default}; paper: {paper}"
-        kind = {"action": argparse.BooleanOptionalAction}
-        if not isinstance(default, bool):
-            choices = f.metadata.get("choices")
-            kind = {"type": type(default), "choices": choices,
-                    "metavar": None if choices else type(default).__name__.upper()}
+        choices = f.metadata.get("choices")
+        kind = {"action": argparse.BooleanOptionalAction} if isinstance(default, bool) else {
+            "type": type(default), "choices": choices,
+            "metavar": None if choices else type(default).__name__.upper()}
         group.add_argument(f"--{prefix}{f.name}".replace("_", "-"), default=None,
                            dest=f"{config_class.__name__}.{f.name}",
                            help=f"{f.metadata['help']} [{shown}]", **kind)
@@ -2662,10 +2658,9 @@ def from_args(config_class, args, **defaults):
     return config_class(**{**defaults, **{k: v for k, v in given.items() if v is not None}})
 
 
-def preset_values(config_class, preset):
+def preset_values(config, preset):
     """What a preset takes instead of the default of a config's fields."""
-    return {f.name: f.metadata[preset] for f in dataclasses.fields(config_class)
-            if preset in f.metadata}
+    return {f.name: f.metadata[preset] for f in dataclasses.fields(config) if preset in f.metadata}
 
 
 def natural(text, least=0):
@@ -2679,8 +2674,7 @@ def add_command(commands, name, run, help, **extra):
     """A sub-command with --json, which every one has."""
     sub = commands.add_parser(name, help=help, description=help, allow_abbrev=False, **extra)
     sub.set_defaults(run=run)
-    sub.add_argument("--json", action="store_true",
-                     help="print one JSON object as the last line of stdout")
+    sub.add_argument("--json", action="store_true", help="print JSON as the last line of stdout")
     return sub
 
 
@@ -2716,8 +2710,7 @@ def make_parser():
     add("--replay", help="replay file [replay.npz beside the expert]")
     add("--out", help="folder for the results [runs/TASK-SEED]")
     add("--eval-seed", type=natural, default=0, help="of the evaluation episodes [0]")
-    add("--evaluate-expert", action="store_true",
-        help="measure the expert's return anew instead of reading its record")
+    add("--evaluate-expert", action="store_true", help="measure the expert, in spite of a record")
     add("--episodes", type=positive, default=20, help="evaluation episodes [20]")
     add("--workers", type=natural, help="processes that play episodes; 0: this one [cores]")
     add_config(sub, DistillConfig)
@@ -2749,9 +2742,16 @@ def run_command(parser, argv=None):
     if hasattr(sys.stdout, "reconfigure"):  # a terminal that has no ±
         sys.stdout.reconfigure(errors="replace")
     try:
-        result = args.run(args)
-        print(json.dumps(result) + "\n" if args.json else "", end="", flush=True)
-    except (UserError, MemoryError, OSError) as error:
+        with contextlib.ExitStack() as stack:
+            if args.json and argv is None:  # the last line, whatever a robot prints in C, or ending
+                own = os.fdopen(os.dup(1), "w", encoding=sys.stdout.encoding, errors="replace")
+                stack.enter_context(contextlib.redirect_stdout(stack.enter_context(own)))
+                os.dup2(2, 1)
+            result = args.run(args)
+            print(f"\n{json.dumps(result)}\n" if args.json else "", end="", flush=True)
+    except (UserError, MemoryError, OSError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "start new thread" not in str(error):
+            raise  # a mistake of ours; that one is a limit's
         if isinstance(error, OSError) and error.filename:
             error = f"{error.filename}: can't be read or written: {error.strerror}"
         elif isinstance(error, OSError):  # a full stdout's, which would fail again at the end

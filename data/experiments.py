@@ -15,7 +15,6 @@ import contextlib
 import csv
 import ctypes
 import dataclasses
-import fcntl
 import functools
 import importlib.util
 import io
@@ -95,7 +94,6 @@ def append_rows(path, rows):
     text = io.StringIO()
     writer = csv.DictWriter(text, ROW, lineterminator="\n")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         with open(path, "a+b") as file:
             file.seek(0)
             before = file.read()
@@ -113,17 +111,10 @@ def append_rows(path, rows):
 
 
 def lock(path):
-    """A CSV that one command has until it closes this, or ends; UserError if another has it."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file = open(path, "ab")
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise fac.UserError(f"{path}: another command is at its runs; wait for its end, or choose "
-                            "another --out") from None
-    except OSError as error:
-        raise fac.UserError(f"{path}: can't be written: {error.strerror}") from None
-    return file
+    """`fac.locked` for a CSV, which is made."""
+    fac.check_writable(path)
+    path.touch()
+    return fac.locked(path, folder=False)
 
 
 def finished(rows):
@@ -141,7 +132,7 @@ def attempt(function, run, home):
         multiprocessing.set_start_method("spawn", force=True)  # loky's can't start a run's workers
         if os.getppid() == home and sys.platform == "linux":  # ends with it
             ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG, SIGKILL
-    began = time.time()
+    began = time.monotonic()
     with fac.one_thread(), contextlib.redirect_stdout(sys.stderr):
         try:
             settings = json.loads(run["settings"])
@@ -151,7 +142,7 @@ def attempt(function, run, home):
             found = list(function(run["task"], int(run["seed"]), run["case"], settings))
             fac.need(all(np.isfinite(v) for row in found for v in row.values()
                          if isinstance(v, float)), f"found {found[-1]}, not finite")
-            found[-1].setdefault("minutes", (time.time() - began) / 60)
+            found[-1].setdefault("minutes", (time.monotonic() - began) / 60)
         except Exception as error:
             return failed(run, error)
     return [{**run, **row, "versions": versions()} for row in found]

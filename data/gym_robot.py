@@ -33,6 +33,18 @@ class GymRobot:
     its own bounds and applied `action_repeat` times, observations (O,), and at most `episode_steps`
     decisions an episode. ValueError: Gymnasium can't make it, or its spaces are others."""
 
+    _folder = "."  # which a robot may change, to find its meshes
+
+    def _ask(self, function, *values, **options):
+        """What a robot's function returns, in its own folder: below ours are a user's files."""
+        ours = os.getcwd()
+        os.chdir(self._folder)
+        try:
+            return function(*values, **options)
+        finally:
+            self._folder = os.getcwd()
+            os.chdir(ours)
+
     def __init__(self, name, action_repeat=1):
         file = Path(__file__).with_name(f"{name.rpartition(':')[0]}.py")
         theirs = (Path(folder, file.name)
@@ -42,7 +54,7 @@ class GymRobot:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that there is a newer version of the ID
             try:
-                self.env = gymnasium.make(name, disable_env_checker=True)
+                self.env = self._ask(gymnasium.make, name, disable_env_checker=True)
             except (Exception, SystemExit) as error:  # a constructor, or a script, can raise any
                 raise ValueError(" ".join(str(error).split())[:300] or repr(error)) from None
         steps = self.env.spec.max_episode_steps
@@ -68,7 +80,7 @@ class GymRobot:
 
     def reset(self, seed):
         """Start the episode that the integer `seed` stands for; returns (dim O,)."""
-        obs, _ = self.env.reset(seed=int(seed))
+        obs, _ = self._ask(self.env.reset, seed=int(seed))
         return obs
 
     def step(self, action):
@@ -78,8 +90,8 @@ class GymRobot:
         control = np.clip(low + (high - low) * (np.asarray(action, float) + 1) / 2, low, high)
         total, terminated, truncated = 0.0, False, False
         for _ in range(self.action_repeat):
-            obs, reward, terminated, truncated, _ = self.env.step(
-                control.astype(self._space.dtype))
+            obs, reward, terminated, truncated, _ = self._ask(
+                self.env.step, control.astype(self._space.dtype))
             total += reward
             if terminated or truncated:
                 break
@@ -88,6 +100,6 @@ class GymRobot:
     def close(self):
         """Let go of what the robot holds; what that raises is said, and costs nothing else."""
         try:
-            self.env.close()
+            self._ask(self.env.close)
         except Exception as error:
             print(f"{self.env.spec.id}: close: {error!r}", file=sys.stderr)

@@ -73,21 +73,16 @@ def read_zip(path):
     """{name: bytes} of a zip's members; nothing is unpacked before the limits are checked."""
     size, found = path.stat().st_size, {}
     limit = min(MAX_BYTES, MAX_PIECE + MAX_RATIO * size)
-    try:
-        with BoundedFile(path) as file, zipfile.ZipFile(file) as archive:
-            members = archive.infolist()
-            total = sum(m.file_size for m in members)
-            need(len(members) <= MAX_MEMBERS and total <= limit, f"{len(members)} members that "
-                 f"unpack to {total} bytes; expected at most {MAX_MEMBERS} and {limit}")
-            need(all(m.compress_type in (0, 8) and not m.flag_bits & 1 for m in members),
-                 "encrypted, or packed with something else than deflate; pack it anew")
-            for m in members:
-                need(m.filename not in found, f"{short(m.filename)}: two members of this name")
-                found[m.filename] = unpack(archive, m)
-    except (fac.UserError, MemoryError):
-        raise
-    except Exception as error:  # a damaged file can raise nearly anything
-        raise fac.UserError(f"not a readable zip archive ({short(error)}); incomplete?") from None
+    with BoundedFile(path) as file, zipfile.ZipFile(file) as archive:
+        members = archive.infolist()
+        total = sum(m.file_size for m in members)
+        need(len(members) <= MAX_MEMBERS and total <= limit, f"{len(members)} members that "
+             f"unpack to {total} bytes; expected at most {MAX_MEMBERS} and {limit}")
+        need(all(m.compress_type in (0, 8) and not m.flag_bits & 1 for m in members),
+             "encrypted, or packed with something else than deflate; pack it anew")
+        for m in members:
+            need(m.filename not in found, f"{short(m.filename)}: two members of this name")
+            found[m.filename] = unpack(archive, m)
     return found
 
 
@@ -302,14 +297,10 @@ def read_safetensors(path):
     data = path.read_bytes()
     need(int.from_bytes(data[:8], "little") <= MAX_HEADER,
          f"not a safetensors file, or one with a header of more than {MAX_HEADER} bytes")
-    try:
-        found = deserialize(data)
-    except Exception as error:  # the library's own, mostly
-        raise fac.UserError(f"not a readable safetensors file ({short(error)})") from None
     kinds = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "BF16": "<u2"}
     return {name: np.ndarray(t["shape"], kinds[t["dtype"]], t["data"])
             if t["dtype"] in kinds and len(t["shape"]) <= MAX_RANK and t["data"] else
-            Unread(f"{t['dtype']} {t['shape'][:MAX_RANK]}") for name, t in found}
+            Unread(f"{t['dtype']} {t['shape'][:MAX_RANK]}") for name, t in deserialize(data)}
 
 
 # ------------------------------------------------------------------------------------ HDF5
@@ -323,36 +314,43 @@ def read_hdf5(path):
     from Minari's episodes, its groups. Of the file's own bytes alone: it may name others."""
     with fac.optional("h5py for HDF5", "hdf5"):
         import h5py
-    left = min(MAX_BYTES, MAX_PIECE + MAX_RATIO * path.stat().st_size)
+    left = limit = min(MAX_BYTES, MAX_PIECE + MAX_RATIO * path.stat().st_size)
     theirs = [*filter(None, OWN.values())]
+
+    def own(group, name):
+        need(type(group.get(name, getlink=True)) is h5py.HardLink, f"{name}: expected in this "
+             "file, found a link; what is elsewhere isn't read: copy all into one file")
+        return group[name]
 
     def arrays(group, names):
         nonlocal left
-        found = {}
-        for name in filter(group.__contains__, names):
-            own = type(group.get(name, getlink=True)) is h5py.HardLink
-            data = group[name] if own else None
-            need(type(data) is h5py.Dataset and not (data.external or data.is_virtual) and
-                 data.dtype.kind in "fbiu" and data.nbytes <= left, f"{name}: expected an array in "
-                 f"this file, of numbers, of at most {left} bytes")
+        found, at = {}, group.name.strip("/")
+        for name in filter(names.__contains__, group):  # also links that lead nowhere
+            data, where = own(group, name), f"{at}: {name}".removeprefix(": ")
+            need(type(data) is h5py.Dataset, f"{where}: expected an array, found a group of "
+                 f"{', '.join(map(short, getattr(data, 'keys', list)()))[:99]}")
+            need(not (data.external or data.is_virtual) and data.dtype.kind in "fbiu", f"{where}: "
+                 f"expected numbers in this file, found {short(data.dtype)}, or what others hold")
+            about = data.id.get_create_plist()
+            for code, *_ in map(about.get_filter, range(about.get_nfilters())):
+                need(h5py.h5z.filter_avail(code), f"{where}: packed by HDF5's filter {code}, which "
+                     "h5py lacks; write it with gzip, where you have that one (hdf5plugin)")
+            need(data.nbytes <= left, f"{where}: with what is before it, more than {limit} bytes, "
+                 "the most that is read of this file; give a part of it")
             found[name], left = data[()], left - data.nbytes
         return found
 
-    try:
-        with h5py.File(path, "r") as file:
-            groups = [name for name in file if re.fullmatch("episode_[0-9]+", name)
-                      and isinstance(file.get(name, getlink=True), h5py.HardLink)]
-            if groups:
-                return from_minari({name: arrays(file[name], theirs) for name in sorted(
-                    groups, key=lambda name: int(name[8:]))})
-            found = arrays(file, (*OWN, *theirs, *D4RL_ENDS))
-            need(found, "expected observation, action and continues (README), D4RL's names, or "
-                 f"Minari's groups, found {', '.join(map(short, [*file][:9])) or 'nothing'}")
-            return found
-    except fac.UserError:
-        raise
-    except Exception as error:  # the library's own, mostly
-        raise fac.UserError(f"not a readable HDF5 file ({short(error)})") from None
+    with h5py.File(path, "r") as file:
+        if episodes := [name for name in file if re.fullmatch("episode_[0-9]+", name)]:
+            count = file.attrs.get("total_episodes", len(episodes))
+            need(count == len(episodes), f"expected {count} episodes, its total_episodes, found "
+                 f"{len(episodes)}; copy all into one file")
+            return from_minari({name: arrays(own(file, name), theirs) for name in sorted(
+                episodes, key=lambda name: int(name[8:]))})
+        found = arrays(file, (*OWN, *theirs, *D4RL_ENDS))
+        need(found, "expected observation, action and continues (README), D4RL's names, or "
+             f"Minari's groups, found {', '.join(map(short, [*file][:9])) or 'nothing'}")
+        return found
 
 
 def from_minari(episodes):
@@ -366,8 +364,7 @@ def from_minari(episodes):
                for episode in episodes.values()]
     ends = np.zeros(sum(map(len, actions)), bool)
     ends[np.cumsum([*map(len, actions)]) - 1] = True
-    return {"observations": np.concatenate([episode["observations"]
-                                            for episode in episodes.values()]),
+    return {"observations": np.concatenate([own["observations"] for own in episodes.values()]),
             "actions": np.concatenate(actions), "timeouts": ends}
 
 
@@ -379,15 +376,18 @@ REPLAYS = {".npz": read_npz, ".hdf5": read_hdf5, ".h5": read_hdf5}
 
 @contextlib.contextmanager
 def reading(path, kinds=CHECKPOINTS):
-    """What a file holds, found by the end of its name; every UserError inside begins with it."""
+    """What a file holds, found by the end of its name; UserError, which begins with it, for all
+    that goes wrong inside: a damaged file can raise nearly anything."""
     try:
         need(Path(path).is_file() and Path(path).suffix in kinds,
              f"no such file, or its name doesn't end in {', '.join(kinds)}")
         yield kinds[Path(path).suffix](Path(path))
     except fac.UserError as error:
         raise fac.UserError(f"{path}: {error}") from None
-    except OSError as error:
-        raise fac.UserError(f"{path}: can't be read: {error.strerror or error}") from None
+    except Exception as error:
+        need(isinstance(error, MemoryError), f"{path}: not a readable {Path(path).suffix} file "
+             f"({fac.shown(error)}); incomplete?")
+        raise
 
 
 FIRST = "_encoder.0.weight"

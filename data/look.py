@@ -219,7 +219,7 @@ def command_figure9(args):
     except fac.UserError as error:
         undrawn = error  # said below: what can't be used has one line
     model, header, task = open_model(args, kinds=["student"])
-    plt, began = need_plots(args.out), time.time()
+    plt, began = need_plots(args.out), time.monotonic()
     config = fac.PlannerConfig(**fac.made_for(header, args.model))
     most = fac.episode_steps(config.action_repeat) - SMOOTH
     fac.need(model.config.latent_dim > 1 and config.horizon < most,
@@ -268,7 +268,7 @@ def command_figure9(args):
     result = {"out": args.out, "task": task, "episodes": args.episodes, "silhouette": apart,
               "silhouette_shuffled": shuffled, "silhouette_untrained": first,
               "return_best": float(returns.max()), "return_worst": float(returns.min()),
-              "moments": moments, "seconds": round(time.time() - began, 1)}
+              "moments": moments, "seconds": round(time.monotonic() - began, 1)}
     if apart is not None:
         print(f"silhouette by agent {apart:.2f}, shuffled {shuffled:.2f}, untrained {first:.2f}")
     print(args.out)

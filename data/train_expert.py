@@ -480,7 +480,7 @@ class Training:
 
         Evaluations are of the weights at the round's start: they belong to the row before.
         """
-        envs, quota, began = self.args.envs, self.args.envs * self.steps, time.time()
+        envs, quota, began = self.args.envs, self.args.envs * self.steps, time.monotonic()
         warming, row = self.warming, {**dict.fromkeys(CURVE), **self.scheduled()}
         tested = self.curve and not warming and self.decisions % self.args.evaluate_every < quota
         tests, planners = (self.tests(), self.planners()) if tested else ([], {})
@@ -502,7 +502,7 @@ class Training:
         if warming and not self.warming:  # one round's behind, as later
             losses = self.learn_until(int(self.allowed), bar)
         self.allowed += self.config.updates_per_step * quota
-        self.seconds += time.time() - began
+        self.seconds += time.monotonic() - began
         self.note(tests, episodes[len(playing):])
         returns = [float(reward.sum()) for played in episodes[:envs]  # the last one was cut off
                    for *_, reward, _ in played[:-1] or played]
@@ -522,7 +522,7 @@ class Training:
 
     def finish(self, actors, bar):
         """The updates that are left, and an evaluation of what came out."""
-        began = time.time()
+        began = time.monotonic()
         self.learn_until(int(self.allowed), bar)
         self.curve[-1]["updates"] = self.learner.updates
         actors.begin(tests := self.tests())
@@ -530,7 +530,7 @@ class Training:
             actors.play(25, {} if played else self.planners())
             actors.receive_all()
         self.note(tests, actors.episodes())
-        self.seconds += time.time() - began
+        self.seconds += time.monotonic() - began
 
     def save(self, out):
         """Write the checkpoint and then, for it holds their rows, the curve."""
@@ -564,7 +564,7 @@ class Training:
             self.buffer.load(arrays)
             for key in ("decisions", "allowed", "seconds", "curve"):
                 setattr(self, key, header[key])
-            if min(self.decisions, self.allowed, self.seconds) < 0 or any(
+            if min(self.decisions, self.allowed, abs(self.seconds)) < 0 or any(
                     row.keys() != {*CURVE} for row in self.curve):
                 raise ValueError("curve")
         except (LookupError, TypeError, ValueError, AttributeError,
@@ -635,15 +635,14 @@ def train_in(out, args, config, planning, distilling):
         training.load(checkpoint)
     else:
         fac.need(not args.resume, f"{checkpoint}: no such file; there is nothing to resume")
-        for name in ("expert.npz", "replay.npz", "student.npz", "curve.csv"):
-            fac.need(not (out / name).exists(), f"{out / name}: not this run's, which would "
-                     "replace it; choose another --out")
+        fac.need_none(out, *(f"{name}.{end}" for name in ("expert", "student") for end in (
+            "npz", "json")), "replay.npz", "curve.csv", "curve.png")
     left = config.updates_per_step * max(0, args.steps - training.decisions)
-    began, done = time.time(), False
+    began, done = time.monotonic(), False
     with Actors(args.task, min(args.workers, args.envs), planning.action_repeat) as actors, \
             fac.one_thread(), fac.progress("training", int(training.allowed + left), "update",
                                            training.learner.updates) as bar:
-        while not done and not (args.minutes and time.time() - began > 60 * args.minutes):
+        while not done and not (args.minutes and time.monotonic() - began > 60 * args.minutes):
             if training.decisions < args.steps:
                 training.round(actors, bar)
             else:

@@ -325,8 +325,8 @@ def train(args):
     torch.backends.cuda.matmul.allow_tf32 = True
     torch.manual_seed(args.seed)
     before = [started(*of) for of in zip(args.start, args.tasks, sizes)]
-    held = next(Path(args.out).glob("*/expert.npz"), None)
-    fac.need(not held, f"{held}: another run's; choose another --out")
+    for folder in (args.out, *Path(args.out).glob("*/")):
+        fac.need_none(folder, "expert.npz", "replay.npz", "curve.csv")
     models = [before[i][0] if i < len(before) else fac.WorldModel.create(
         size, fac.stream(args.seed, "expert", i), policy=True) for i, size in enumerate(sizes)]
     episodes = max(1, config.buffer_size // fac.EPISODE_STEPS // args.envs) * args.envs
@@ -354,7 +354,7 @@ class Run:
     def __init__(self, args, config, learner, workers, before):
         self.args, self.config, self.learner, self.workers = args, config, learner, workers
         self.before = before
-        self.began, self.decisions = time.time(), 0
+        self.began, self.decisions = time.monotonic(), 0
         self.curves = [[] for _ in args.tasks]
         new, (T, E) = learner.torch.zeros, (len(args.tasks), args.envs)
         self.obs_now = new(T, E, learner.dim_obs, device=learner.device)
@@ -364,7 +364,7 @@ class Run:
     @property
     def seconds(self):
         """Since the start."""
-        return time.time() - self.began
+        return time.monotonic() - self.began
 
     def schedule(self):
         """Exploration and learning rate of now."""
@@ -440,7 +440,6 @@ class Run:
         count = min(args.replay, held)
         for i, (task, curve) in enumerate(zip(args.tasks, self.curves)):
             folder = Path(out) / (task if args.tasks.count(task) == 1 else f"{task}-{i}")
-            folder.mkdir(parents=True, exist_ok=True)
             model = learner.expert(i)
             about = {"task": task, "seed": args.seed, "decisions": self.decisions,
                      "updates": learner.updates, "action_repeat": fac.ACTION_REPEAT,
@@ -454,19 +453,18 @@ class Run:
             try:
                 # as float16: half of the room
                 fac.save_model(folder / "expert.npz", model, {"kind": "expert", **about}, True)
+                episodes = ReplayBuffer(model.config.dim_obs, model.config.dim_action,
+                                        count * fac.EPISODE_STEPS)
+                for j in np.arange(count) * held // count:
+                    obs, action, reward = (x[i, j].cpu().numpy() for x in (
+                        learner.obs, learner.action, learner.reward))
+                    episodes.add(obs[:, :model.config.dim_obs],
+                                 action[:, :model.config.dim_action], reward)
+                episodes.write(folder / "replay.npz", about)
+                fac.write_curve(folder / "curve.csv", CURVE, curve)
             except fac.UserError as error:  # one task's failure is not the others'
                 print(error, file=sys.stderr)
                 failed += 1
-                continue
-            episodes = ReplayBuffer(model.config.dim_obs, model.config.dim_action,
-                                    count * fac.EPISODE_STEPS)
-            for j in np.arange(count) * held // count:
-                obs, action, reward = (x[i, j].cpu().numpy() for x in (
-                    learner.obs, learner.action, learner.reward))
-                episodes.add(obs[:, :model.config.dim_obs], action[:, :model.config.dim_action],
-                             reward)
-            episodes.write(folder / "replay.npz", about)
-            fac.write_curve(folder / "curve.csv", CURVE, curve)
         return failed
 
 

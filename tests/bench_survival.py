@@ -24,7 +24,7 @@ from test_cli import ONE_THREAD, ROOT, TINY, write_expert, write_replay
 import fac_tdmpc_ref as fac
 from test_planning import random_model
 
-FAST_CLOCK = ("import sys, time; clock = time.time; time.time = lambda: 60 * clock(); "
+FAST_CLOCK = ("import sys, time; clock = time.monotonic; time.monotonic = lambda: 60 * clock(); "
               f"sys.path.insert(0, {str(ROOT)!r}); import fac_tdmpc_ref; "
               "sys.exit(fac_tdmpc_ref.main(sys.argv[1:]))")
 

@@ -1,4 +1,9 @@
 """Robots for test_gym.py, registered as a user's own are: gym:gym_toys:Walk-v0."""
+import atexit
+import ctypes
+import os
+import tempfile
+
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete
@@ -59,6 +64,28 @@ class Stuck(Walk):
         raise RuntimeError("motor off failed")
 
 
+class Elsewhere(Walk):
+    """Reads its meshes below a folder of its own, to which it goes, and is loud: in Python without
+    a line's end, in C and as its process ends."""
+
+    def __init__(self):
+        super().__init__()
+        self.home = tempfile.TemporaryDirectory()
+        os.chdir(self.home.name)
+        open("arm.obj", "w").close()
+        self.folder = os.getcwd()
+        atexit.register(print, "simulator closed")
+
+    def reset(self, seed=None, options=None):
+        os.stat("arm.obj")
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        ctypes.CDLL(None).printf(b"contact\n")
+        print(".", end="")
+        return super().step(action)
+
+
 class Hot(Walk):
     """Raises in its third decision of an episode."""
 
@@ -98,6 +125,7 @@ if "Walk-v0" not in gymnasium.registry:
     gymnasium.register("Endless-v0", Walk, kwargs={"falls": False})
     gymnasium.register("Port-v0", Port, max_episode_steps=12)
     gymnasium.register("Stuck-v0", Stuck, max_episode_steps=12)
+    gymnasium.register("Elsewhere-v0", Elsewhere, max_episode_steps=12)
     gymnasium.register("Hot-v0", Hot, max_episode_steps=12, kwargs={"falls": False})
     for odd in ("seed", "reset", "step", "reward"):
         gymnasium.register(f"Older-{odd}-v0", Older, max_episode_steps=12, kwargs={"odd": odd})

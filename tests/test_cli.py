@@ -2,14 +2,18 @@
 
 import csv
 import dataclasses
+import errno
 import importlib.util
 import json
+import multiprocessing.resource_tracker
 import os
 import re
 import signal
 import subprocess
 import sys
+import threading
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -520,6 +524,46 @@ def test_a_pool_s_process_times_itself_alone(monkeypatch):
     assert found["plan_ms_student"] == found["plan_ms_student_in_process"] > 0
 
 
+def no_more(*_, **__):
+    raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+
+@pytest.mark.parametrize("what", ["multiprocessing.util.spawnv_passfds", "os.pipe",
+                                  "multiprocessing.connection.Pipe"])
+def test_where_no_process_can_be_started_none_is_needed(tmp_path, files, capsys, monkeypatch, what):
+    """At a limit of processes or of open files: --workers 0 asks for none."""
+    monkeypatch.setattr(fac, "cores", lambda: 2)
+    monkeypatch.setattr(multiprocessing.resource_tracker, "ensure_running", lambda: None)
+    monkeypatch.setattr(what, no_more)
+    arguments = [*map(str, distill_arguments(files, "--out", tmp_path / "out", "--workers"))]
+    assert fac.main([*arguments, "2"]) == 2
+    assert "no process can be started" in (line := capsys.readouterr().err.splitlines()[-1])
+    assert "--workers 0" in line and "limit" in line
+    assert fac.main([*arguments, "0"]) == 0
+    assert json.loads((tmp_path / "out" / "result.json").read_text())["plan_workers"] == 0
+
+
+def test_where_no_thread_can_be_started_it_is_said_in_a_line(tmp_path, files, capsys, monkeypatch):
+    def refuse(*_, **__):
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    arguments = distill_arguments(files, "--out", tmp_path / "out", "--workers", "0")
+    assert fac.main([*map(str, arguments)]) == 2
+    assert "error: can't start new thread" in capsys.readouterr().err.splitlines()[-1]
+    monkeypatch.undo()
+    monkeypatch.setattr(fac.Distiller, "step", lambda _: {}["a mistake"])
+    with pytest.raises(KeyError):
+        fac.main([*map(str, arguments)])
+
+
+def test_returns_are_on_disk_before_anything_is_timed(tmp_path, files, capsys, monkeypatch):
+    monkeypatch.setattr(fac, "time_both", no_more)
+    out = tmp_path / "out"
+    assert fac.main([*map(str, distill_arguments(files, "--out", out, "--workers", "0"))]) == 2
+    assert len(json.loads((out / "result.json").read_text())["student_returns"]) == 1
+
+
 def test_timings_take_turns_and_count_the_second_call_of_each(monkeypatch):
     """One that takes 9 seconds after the other's call and 1 after its own, and one that takes 2."""
     clock, called, takes = [0.0], [], {"a": [9, 1] * 3, "b": [2] * 6}
@@ -725,14 +769,15 @@ def test_the_same_command_gives_the_same_student(tmp_path, files, distilled, no_
 
 # going on after a crash ---------------------------------------------------------------
 
-# `distill` with a checkpoint after every second row of the curve (the clock strides), a made-up
+# `distill` with a checkpoint after every third row of the curve (the clock strides), a made-up
 # evaluation, and a SIGKILL before step argv[1]: nothing gets to clean up.
 DRIVER = f"""
 import itertools, os, signal, sys, time, types
 sys.path.insert(0, {str(ROOT)!r})
 import fac_tdmpc_ref as fac
 clock = itertools.count()
-fac.time = types.SimpleNamespace(time=lambda: 13.0 * next(clock), perf_counter=time.perf_counter)
+fac.time = types.SimpleNamespace(monotonic=lambda: 7.0 * next(clock),
+                                 perf_counter=time.perf_counter)
 fac.evaluate = lambda *_, **__: {{"returns": [1.0]}}
 stop, step = int(sys.argv[1]), fac.Distiller.step
 def step_or_die(self):
@@ -759,7 +804,7 @@ def killed(tmp_path, files, no_plots):
     assert distill(stop=3).returncode == -signal.SIGKILL
     assert sorted(os.listdir(tmp_path / "out")) == ["checkpoint.npz", "curve.csv"]
     with np.load(tmp_path / "out" / "checkpoint.npz") as file:
-        assert file["step"] == 2  # so that the third step is taken twice
+        assert file["step"] == 1  # so that two steps are taken twice
     return tmp_path / "out", distill
 
 
@@ -858,7 +903,7 @@ def test_a_finished_run_is_not_replaced_by_one_with_other_settings(distilled, fi
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
-@pytest.mark.parametrize("name", ["config.json", "result.json"])
+@pytest.mark.parametrize("name", ["config.json", "result.json", "curve.csv", "curve.png"])
 def test_another_program_s_files_are_not_replaced(tmp_path, files, capsys, name):
     (tmp_path / name).write_text("an hour's work")
     assert fac.main([str(a) for a in distill_arguments(files, "--out", tmp_path)]) == 2
@@ -1109,6 +1154,40 @@ def test_a_record_counts_for_its_own_weights_planner_and_episodes_only(tmp_path)
     assert not found
 
 
+def test_jobs_of_an_array_record_all_their_seeds(tmp_path):
+    """At the same time, and in the program that has the folder."""
+    path, about = tmp_path / "expert.npz", (random_model(), fac.PlannerConfig())
+    path.touch()
+    with fac.locked(tmp_path), ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda seed: fac.record_returns(path, *about, seed, [float(seed)]),
+                      range(40)))
+    assert len(fac.read_records(path)) == 40
+
+
+@pytest.mark.parametrize("name, recorded", [(250 * "n", True), (83 * "\u8d70", True),
+                                            (251 * "n", False)])
+def test_a_record_beside_a_long_name_is_kept_or_refused_before_the_episodes(
+        tmp_path, capsys, monkeypatch, name, recorded):
+    write_expert(tmp_path / "expert.npz")
+    path = (tmp_path / "expert.npz").rename(tmp_path / f"{name}.npz")
+    monkeypatch.setattr(fac, "evaluate", lambda *_: {"returns": [7.0], "plan_ms_median": 1.0})
+    flags = ["evaluate", "--model", str(path), "--record"]
+    assert fac.main(flags) == (0 if recorded else 2)
+    out, err = capsys.readouterr()
+    assert ("reacher-hard" in out) == recorded and ("File name too long" in err) == (not recorded)
+    assert [returns for returns, _ in fac.read_records(path).values()] == [[7.0]] * recorded
+
+
+def test_returns_that_cannot_be_recorded_are_told(files, capsys, monkeypatch):
+    def full(*_):
+        raise fac.UserError("full")
+
+    monkeypatch.setattr(fac, "evaluate", lambda *_: {"returns": [7.0], "plan_ms_median": 1.0})
+    monkeypatch.setattr(fac, "record_returns", full)
+    assert fac.main(["evaluate", "--model", str(files / "expert.npz"), "--record"]) == 2
+    assert "7 \u00b1 0" in capsys.readouterr().out
+
+
 def test_a_record_of_other_versions_gives_way_to_a_shorter_one_of_these(tmp_path):
     path, about = tmp_path / "expert.npz", (random_model(), fac.PlannerConfig(), 5)
     path.with_suffix(".json").write_text(json.dumps({fac.record_key(*about): {
@@ -1131,10 +1210,28 @@ def test_a_spoilt_record_is_named(tmp_path, text):
 
 
 def test_continuous_integration_runs_the_readme_s_test_command():
-    commands = [line.strip() for line in (ROOT / ".ci" / "run").read_text().splitlines()
-                if line.endswith("pytest tests")]
-    assert len(commands) == 1
-    assert commands[0] in (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    """In an environment that holds nothing else: what it installs for more comes later."""
+    lines = (ROOT / ".ci" / "run").read_text().splitlines()
+    (at,) = [i for i, line in enumerate(lines) if line.endswith("pytest tests")]
+    assert lines[at] in (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert not [line for line in lines[:at] if re.search(r"\.venv/bin/pip", line)]
+
+
+def test_the_readme_s_tests_skip_what_needs_pytorch_or_dask_alone():
+    """Of what libraries lack: its extra brings all others."""
+    project = (ROOT / "pyproject.toml").read_text()
+    brought = set(re.findall(r"[\w-]+", " ".join(re.findall(
+        r"^(?:test|experiments) = \[(.*)\]$", project, re.M))))
+    by = {"PIL": "matplotlib", "sklearn": "scikit-learn", "imageio_ffmpeg": "ffmpeg"}
+    for path in (ROOT / "tests").glob("test_*.py"):
+        for name in re.findall(r'importorskip\(\s*"(\w+)', path.read_text("utf-8")):
+            assert by.get(name, name) in brought | {"torch", "distributed"}, (path, name)
+
+
+def test_durations_are_of_a_clock_that_nobody_sets():
+    """A checkpoint of one that was set back would count as damaged."""
+    for path in (*ROOT.glob("*.py"), *(ROOT / "data").glob("*.py")):
+        assert not re.search(r"\btime\.time\(|\bdatetime\b", path.read_text("utf-8")), path
 
 
 def test_mujoco_and_dm_control_are_pinned_as_a_pair():

@@ -440,6 +440,17 @@ def test_mujoco_is_imported_when_an_environment_is_made_and_not_before():
     assert done.returncode == 0, done.stderr
 
 
+def test_a_mujoco_of_another_version_is_explained(monkeypatch):
+    """It imports; its first model shows that it lacks a field."""
+    sizes = fac.import_dm_control()[2].Physics.from_xml_string.__globals__[
+        "wrapper"].mjbindings.sizes.array_sizes["mjmodel"]
+    monkeypatch.setitem(sizes, "of_another_version", ("nv",))
+    for make in (lambda: fac.Environment("reacher-hard"), lambda: fac.Environment("walker-walk"),
+                 lambda: fac.suite_sizes.__wrapped__("cartpole-swingup")):
+        with pytest.raises(fac.UserError, match="of_another_version.*mujoco==3.17.0 beside dm-con"):
+            make()
+
+
 def test_a_bad_rendering_setting_is_explained():
     done = python("import fac_tdmpc_ref as fac\ntry: fac.Environment('reacher-hard')\n"
                   "except fac.UserError as error: print(error)", MUJOCO_GL="nonsense")

@@ -157,7 +157,7 @@ def test_a_killed_sweep_goes_on_and_makes_no_run_twice(tmp_path):
     path, begun = tmp_path / "sweep.csv", time.time()
     while not rows_of(path) and time.time() - begun < 100:
         time.sleep(0.05)
-    refused(run(*flags, cwd=tmp_path), "sweep.csv: another command is at its runs", "--out")
+    refused(run(*flags, cwd=tmp_path), "sweep.csv: another run is writing", "--out")
     process.kill()  # which leaves no lock
     process.wait()
     before = rows_of(path)
@@ -251,13 +251,15 @@ def test_a_damaged_row_is_shown(tmp_path, column, value):
 def test_a_csv_is_one_command_s_until_it_ends(tmp_path):
     path = tmp_path / "new" / "7.csv"
     with experiments.lock(path):
-        with pytest.raises(fac.UserError, match="7.csv: another command is at its runs"):
-            experiments.lock(path)
-        with pytest.raises(fac.UserError, match="another command"):  # which adds milliseconds
+        with pytest.raises(fac.UserError, match="7.csv: another run is writing"):
+            with experiments.lock(path):
+                pass
+        with pytest.raises(fac.UserError, match="another run"):  # which adds milliseconds
             experiments.time_all(None, {"out": str(path)}, [], None)
         experiments.append_rows(path, [{**experiments.make_run("x", 0, "y"), "minutes": 1.0}])
         assert len(experiments.read_rows(path)) == 1
-    experiments.lock(path).close()
+    with experiments.lock(path):
+        assert len(experiments.read_rows(path)) == 1
 
 
 def test_workers_end_with_the_process_that_waits_for_them(tmp_path):
@@ -833,6 +835,7 @@ def test_a_seed_that_lacks_runs_is_left_out(tmp_path, capsys):
 
 
 def test_negative_returns_are_drawn(tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
     drawn = []
     monkeypatch.setattr(fac, "save_figure", lambda path, figure: drawn.extend(figure.axes))
     for values in ([-1200.0, -250.0], [0.0, 900.0]):

@@ -2,6 +2,7 @@
 import contextlib
 import csv
 import json
+import os
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ import fac_tdmpc_ref as fac
 import import_expert
 import multitask
 import train_expert
-from test_cli import BLOCKED, ONE_THREAD, ROOT, SCRIPT, launch, refused, succeeded
+from test_cli import (
+    BLOCKED, ONE_THREAD, ROOT, SCRIPT, last_json, launch, refused, succeeded, write_expert)
 from test_equation1 import small_batch, small_learner
 from test_layers import assert_close
 
@@ -97,6 +99,33 @@ def test_a_robot_s_end_that_raises_costs_no_episode(capsys):
     found = fac.evaluate(model, "gym:gym_toys:Stuck-v0", config, 2, 0, 0)
     assert found["returns"] == [fallen(seed) for seed in fac.episode_seeds(0, 2)]
     assert "Stuck-v0: close: RuntimeError('motor off failed')" in capsys.readouterr().err
+
+
+def test_a_robot_s_own_folder_and_prints_are_not_the_command_s(tmp_path):
+    """Files that the user names are below ours; JSON is the last line, and begins one."""
+    elsewhere = "gym:gym_toys:Elsewhere-v0"
+    robot, home = fac.make_robot(elsewhere), os.getcwd()
+    for act in (lambda: robot.reset(0), lambda: robot.step(np.zeros(2)), robot.close):
+        act()
+        assert os.getcwd() == home and robot._ask(os.getcwd) == robot.env.unwrapped.folder
+    env = {**ONE_THREAD, "PYTHONPATH": str(ROOT / "tests"), "PYTHONUNBUFFERED": ""}
+    (tmp_path / "mine").mkdir()
+    write_expert(tmp_path / "mine" / "expert.npz", elsewhere, (3, 2))
+    budget = ["--episodes", "2", "--plan-samples", "4", "--plan-iterations", "1", "--workers"]
+    small = [flag.replace("--plan-", "--") for flag in budget]
+    commands = [
+        [SCRIPT, "evaluate", "--model", "mine/expert.npz", "--record", *small, "0"],
+        [ROOT / "data" / "import_expert.py", "mine/expert.npz", "--task", elsewhere, "--collect",
+         "8", "--out", "out"],
+        [SCRIPT, "distill", "--task", elsewhere, "--expert", "out", "--out", "student",
+         "--batch-size", "4", "--steps", "4", *budget, "1"],
+        [ROOT / "data" / "train_expert.py", *SMALL[:-2], "--task", elsewhere, "--envs", "1",
+         "--steps", "12", "--seed-decisions", "12", "--out", "trained", "--evaluate-episodes", "1",
+         *budget[:2], "--workers", "1"]]
+    for command in commands:
+        assert isinstance(last_json(launch([*command, "--json"], tmp_path, env)), dict)
+    assert {"mine/expert.json", "out/replay.npz", "student/result.json", "trained/expert.npz"} <= {
+        str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")}
 
 
 def test_a_module_that_data_hides_is_refused(tmp_path, monkeypatch):

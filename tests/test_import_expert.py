@@ -440,8 +440,8 @@ def test_an_expert_without_policy_is_imported_with_a_word(tmp_path, capsys):
 
 @pytest.mark.parametrize("name, data, parts", [
     ("model.pt", b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.", ["older than PyTorch 1.6", "save"]),
-    ("model.pt", b"PK\x03\x04 and no more", ["not a readable zip"]),
-    ("model.npz", b"", ["not a readable zip"]),
+    ("model.pt", b"PK\x03\x04 and no more", ["not a readable"]),
+    ("model.npz", b"", ["not a readable"]),
     ("model.pkl", b"", ["doesn't end in .pt, .pth, .npz, .safetensors"]),
     ("missing.pt", None, ["no such file"]),
 ])
@@ -676,7 +676,7 @@ def test_zip_bombs_and_odd_archives_are_refused(tmp_path, suffix):
     for at, width in ((lie.rindex(b"PK\x01\x02") + 24, 4), (lie.rindex(b"PK\x03\x04") + 22, 4)):
         lie[at:at + width] = struct.pack("<I", 10)
     path.write_bytes(lie)
-    assert "not a readable zip" in str(limited(lambda: load(path), 4))
+    assert "not a readable" in str(limited(lambda: load(path), 4))
     write_zip(path, [*good.items(), *good.items()])
     assert "two members of this name" in str(limited(lambda: load(path), 4))
     write_zip(path, {**good, **{str(i): b"" for i in range(5000)}})
@@ -983,6 +983,38 @@ def test_minari_episodes_become_a_replay(tmp_path):
         import_expert.find_replay(tmp_path / "other.h5", sizes)
 
 
+def test_no_part_of_an_hdf5_file_is_left_out_without_a_word(tmp_path, monkeypatch):
+    """Episodes and ends that are links to other files, there or not, and too many bytes."""
+    h5py = pytest.importorskip("h5py")
+    path, sizes = tmp_path / "main.hdf5", fac.ModelConfig(dim_obs=8, dim_action=3)
+
+    def write(mode="w", count=3, **more):
+        with h5py.File(path, mode) as file:
+            for e in range(count):
+                file[f"episode_{e}/observations"] = np.zeros((6, 8), np.float32)
+                file[f"episode_{e}/actions"] = np.zeros((5, 3), np.float32)
+            for name, value in more.items():
+                file[name] = value
+
+    def refused(*parts):
+        refusal(lambda: import_expert.find_replay(path, sizes), path, *parts)
+
+    for link in (h5py.ExternalLink("nowhere.hdf5", "/episode_0"), h5py.SoftLink("/episode_0")):
+        write(episode_3=link)
+        refused("episode_3: expected in this file, found a link")
+    write()
+    with h5py.File(path, "a") as file:
+        file.attrs["total_episodes"] = np.int64(12)
+    refused("expected 12 episodes, its total_episodes, found 3")
+    write()
+    monkeypatch.setattr(import_expert, "MAX_BYTES", 600)
+    refused("episode_2: observations: ", "more than 600 bytes")
+    monkeypatch.undo()
+    arrays = d4rl_arrays()
+    write(count=0, **{**arrays, "timeouts": h5py.ExternalLink("nowhere.hdf5", "/timeouts")})
+    refused("timeouts: expected in this file, found a link")
+
+
 def test_this_project_s_own_file_keeps_what_it_was_made_for(tmp_path):
     """Such as one of other floats, which load_model sends here."""
     state = {key: value.astype(np.float64) for key, value in weights().items()}
@@ -1019,31 +1051,45 @@ def test_others_actions_are_within_the_robot_s_bounds(tmp_path):
         import_expert.find_replay(theirs, sizes, "gym:Pendulum-v1")
 
 
-def test_an_hdf5_file_holds_its_own_bytes_and_no_more_than_it_has(tmp_path):
+def packed(h5py, file, name, values, number=32001):
+    """An array that says it is packed by one of HDF5's filters, by default Blosc."""
+    about = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    about.set_chunk(values.shape)
+    about.set_filter(number, h5py.h5z.FLAG_OPTIONAL, ())
+    kind, space = h5py.h5t.py_create(values.dtype), h5py.h5s.create_simple(values.shape)
+    h5py.h5d.create(file.id, name.encode(), kind, space, about)
+
+
+def test_an_hdf5_file_holds_its_own_bytes_and_no_more_than_it_has(tmp_path, monkeypatch):
     h5py = pytest.importorskip("h5py")
     secret = tmp_path / "secret"
     secret.write_bytes(bytes(8 * 4 * 140))
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["observations"] = np.zeros((140, 8), np.float32)
     makes = {
-        "link": lambda f: f.__setitem__("observations", h5py.ExternalLink("other.h5",
-                                                                          "/observations")),
-        "soft": lambda f: f.__setitem__("observations", h5py.SoftLink("/rewards")),
-        "external": lambda f: f.create_dataset("observations", (140, 8), "f4", external=[
-            (str(secret), 0, 8 * 4 * 140)]),
-        "large": lambda f: f.create_dataset("observations", (1 << 30, 8), "f4", chunks=True),
-        "texts": lambda f: f.create_dataset("observations", data=["a"] * 140),
-        "group": lambda f: f.create_group("observations")}
-    for name, make in makes.items():
+        "link": ("in this file, found a link", lambda f: f.__setitem__(
+            "observations", h5py.ExternalLink("other.h5", "/observations"))),
+        "soft": ("in this file, found a link", lambda f: f.__setitem__(
+            "observations", h5py.SoftLink("/rewards"))),
+        "external": ("or what others hold", lambda f: f.create_dataset(
+            "observations", (140, 8), "f4", external=[(str(secret), 0, 8 * 4 * 140)])),
+        "large": (f"than {import_expert.MAX_PIECE}", lambda f: f.create_dataset(
+            "observations", (1 << 30, 8), "f4", chunks=True)),
+        "texts": ("found 'object'", lambda f: f.create_dataset("observations", data=["a"] * 140)),
+        "packed": ("packed by HDF5's filter 32001", lambda f: packed(
+            h5py, f, "observations", np.zeros((140, 8), np.float32))),
+        "group": ("a group of 'goal'", lambda f: f.create_group("observations/goal"))}
+    monkeypatch.setattr(import_expert, "MAX_RATIO", 0)
+    for name, (part, make) in makes.items():
         with h5py.File(path := tmp_path / f"{name}.h5", "w") as file:
             for key, value in d4rl_arrays().items():
                 if key != "observations":
                     file[key] = value
             make(file)
-        refusal(lambda path=path: import_expert.find_replay(path, SIZES), path,
-                "observations: expected an array in this file")
+        refusal(lambda path=path: import_expert.find_replay(path, SIZES), path, "observations: ",
+                part)
     (tmp_path / "bad.h5").write_bytes(b"\x89HDF\r\n\x1a\nno more")
-    refusal(lambda: import_expert.find_replay(tmp_path / "bad.h5", SIZES), "not a readable HDF5")
+    refusal(lambda: import_expert.find_replay(tmp_path / "bad.h5", SIZES), "not a readable .h5")
 
 
 def test_an_action_repeat_goes_with_the_files_through_distill_and_evaluate(tmp_path, capsys,

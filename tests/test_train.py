@@ -429,7 +429,8 @@ def test_a_killed_run_goes_on_to_the_same_result(trained, tmp_path):
         assert weights(out, kind) == weights(trained[1], kind)
 
 
-@pytest.mark.parametrize("name", ["expert.npz", "replay.npz", "student.npz", "curve.csv"])
+@pytest.mark.parametrize("name", ["expert.npz", "replay.npz", "student.npz", "curve.csv",
+                                  "curve.png", "expert.json"])
 def test_another_run_s_files_are_not_replaced(tmp_path, name):
     (tmp_path / name).write_text("an hour's work")
     done = train("--out", ".", cwd=tmp_path)

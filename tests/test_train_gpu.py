@@ -132,10 +132,14 @@ def test_an_expert_trained_further(tmp_path, capsys, monkeypatch):
     for name, value in one.params.items():
         np.testing.assert_allclose(value, models()[0].params[name], rtol=1e-3, atol=1e-6)
     assert "before" not in fac.load_model(out / "ball_in_cup-catch" / "expert.npz")[1]
-    for wrong, message in ((["--start", *[str(path)] * 3], "--start: expected at most 2"),
+    (out / "new").mkdir()
+    (out / "new" / TASKS[0]).mkdir()
+    (out / "new" / TASKS[0] / "curve.csv").write_text("another's")
+    for wrong, message in ((["--out", str(out / "new")], "curve.csv: not this run's"),
+                           (["--start", *[str(path)] * 3], "--start: expected at most 2"),
                            (["--start", str(path), str(path)], "expected ('ball_in_cup-catch', 2)"),
                            (["--start", str(path), "--mlp-dim", "8"], "an expert with a policy"),
-                           (["--plan-iterations", "0"], "at least 1"), ([], "another run's")):
+                           (["--plan-iterations", "0"], "at least 1"), ([], "not this run's")):
         assert train_gpu.main([*small, *wrong]) == 2
         assert message in capsys.readouterr().err
 
