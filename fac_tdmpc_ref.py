@@ -115,8 +115,7 @@ class PlannerConfig(Settings):
 
 @dataclasses.dataclass(frozen=True)
 class Algorithm1Config(Settings):
-    """Algorithm 1, as `distill` below reads it. `--preset paper` takes each field's paper value;
-    what Part II adds has its settings there, in `DistillConfig`."""
+    """Algorithm 1; paper: what `--preset paper` takes. Additions: Part II's `DistillConfig`."""
     steps: int = field(7_000, "gradient steps (section 5.1: 10^5) [D1]", paper=100_000, least=1)
     batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=2)
     noise_samples: int = field(5, "K: copies of actions, perturbed [D1]", paper=10, least=2)
@@ -143,11 +142,10 @@ class Algorithm1Config(Settings):
 def student_config(theirs, num_agents, encoder_input, prior_steps=0):
     """A student's sizes: hidden layers max(512 // N, 50) wide, of an expert whose are 512."""
     num_agents = theirs.dim_action if num_agents is None else num_agents
-    below = {} if encoder_input == "observation" else {
-        "expert_latent_dim": theirs.num_agents * theirs.latent_dim,
-        "expert_enc_dim": theirs.enc_dim}
+    latent = theirs.num_agents * theirs.latent_dim * (encoder_input == "latent")
     return ModelConfig(theirs.dim_obs, theirs.dim_action, num_agents, prior_steps=prior_steps,
-                       mlp_dim=max(theirs.mlp_dim // max(1, num_agents), 50), **below)
+                       mlp_dim=max(theirs.mlp_dim // max(1, num_agents), 50),
+                       expert_latent_dim=latent, expert_enc_dim=theirs.enc_dim)
 
 
 def stream(seed, use, index=0):
@@ -198,10 +196,7 @@ def elu_backward(dy, y):
 
 def tanh_backward(dy, y):
     """y = tanh(x): dy/dx = 1 - y^2. Overwrites y with dx."""
-    y *= y
-    np.subtract(1, y, out=y)
-    y *= dy
-    return y
+    return np.multiply(1 - y * y, dy, out=y)
 
 
 def standardize(x):
@@ -392,10 +387,6 @@ class WorldModel:
         actions = np.tanh(self.forward("_prior", latents[:, -sizes.latent_dim:]))
         actions = actions.reshape(sizes.num_agents, sizes.prior_steps, sizes.agent_actions, -1)
         return actions[:, np.minimum(np.arange(steps), sizes.prior_steps - 1)]
-
-    @property
-    def has_prior(self):
-        return self.has_policy or self.config.prior_steps > 0
 
 
 def networks(config, policy=False):
@@ -620,25 +611,20 @@ def mppi(returns, mean, config, rngs, proposals=None):
     mean, std = mean[..., None], F32(config.max_std)
     G_proposals = None if proposals is None else returns(proposals)
     for _ in range(config.iterations):
-        # sample
-        actions = np.stack([rng.standard_normal((*mean.shape[1:3], config.samples), F32)
-                            for rng in rngs])
-        actions *= std
-        actions += mean
-        np.clip(actions, -1, 1, out=actions)
-        # score
-        G = returns(actions)
+        noise = np.stack([rng.standard_normal((*mean.shape[1:3], config.samples), F32)
+                          for rng in rngs])
+        actions = np.clip(mean + std * noise, -1, 1)  # sample
+        G = returns(actions)  # score
         if proposals is not None:
             actions = np.concatenate([actions, proposals], -1)
             G = np.concatenate([G, G_proposals], 1)
         G = np.where(np.isfinite(G), G, F32(-np.inf))  # these weigh nothing
-        # refit: each agent's own elites, axis 1 being the samples (Equation 3)
         best = np.argpartition(-G, config.num_elites - 1, axis=1)[:, :config.num_elites]
-        elites = np.take_along_axis(actions, best[:, None, None], 3)
+        elites = np.take_along_axis(actions, best[:, None, None], 3)  # each agent's own (Eq. 3)
         G = np.take_along_axis(G, best, 1)
         scores = np.exp(config.inverse_temperature * (G - G.max(1, keepdims=True)))
         scores /= scores.sum(1, keepdims=True)
-        p = scores[:, None, None]
+        p = scores[:, None, None]  # refit
         new = (p * elites).sum(3, keepdims=True)
         std = np.sqrt((p * (elites - new) ** 2).sum(3, keepdims=True))
         std = np.clip(std, config.min_std, config.max_std)
@@ -691,13 +677,11 @@ class AgentPlanner:
             first = self.model.prior(latents, self.mean.shape[1])[..., 0]
         if not self.config.iterations:
             return first
-        mean, elites, scores = self.search(latents[:, :self.model.config.latent_dim], first)
+        z = latents[:, :self.model.config.latent_dim]
+        mean, elites, scores = mppi(self.returns_from(z), first, self.config, self.rngs,
+                                    self.proposals(z))
         self.mean = np.concatenate([mean[:, 1:], np.zeros_like(mean[:, :1])], 1)  # warm start
         return mean if self.config.output == "mean" else draw_elite(elites, scores, self.rngs)
-
-    def search(self, z, mean):
-        """`mppi` from the latent z (N, m, 1) and a first mean (N, L, d)."""
-        return mppi(self.returns_from(z), mean, self.config, self.rngs, self.proposals(z))
 
     def returns_from(self, z):
         """What `mppi` asks: actions (N, L, d, S) -> G (N, S)."""
@@ -706,7 +690,7 @@ class AgentPlanner:
     def proposals(self, z):
         """Noisy policy rollouts (1, L, A, P) of an expert (N = 1), if any (TD-MPC's code)."""
         P, L = self.config.pi_trajs, self.config.horizon + 1
-        if not (self.model.has_policy and P and self.config.iterations):
+        if not (self.model.has_policy and P):
             return None
         noise = policy_noise((L, 1, self.model.config.dim_action, P), self.rngs[0])
         return policy_rollout(self.model, np.repeat(z, P, 2), noise).swapaxes(0, 1)
@@ -1236,30 +1220,6 @@ def rank_by_state(distiller, rows, discount, rng):
             spearman(*(horizon_returns(*out, discount) for out in (expert, found))))
 
 
-def standard_error(values, groups):
-    """Of the mean of values (L, B), of which those of one group (B,) are alike, as states of one
-    episode are: a list of L; None where all are of one group."""
-    apart = values - values.mean(1, keepdims=True)
-    sums = np.stack([apart[:, groups == group].sum(1) for group in np.unique(groups)])
-    n = len(sums)
-    return None if n < 2 else (np.sqrt(n / (n - 1) * (sums ** 2).sum(0)) / len(groups)).tolist()
-
-
-def rank_results(distiller, states, discount):
-    """Distiller.ranks for result.json, the return's also in states that were learned from."""
-    rng = stream(distiller.seed, "rank correlation")
-    rows = rng.choice(distiller.held_out_starts, states)
-    q, g = rank_by_state(distiller, rows, discount, rng)
-    known = rng.choice(distiller.train_starts, states)
-    episodes = np.searchsorted(distiller.replay.ends, rows)
-    return {"rank_correlation": float(q[0].mean()), "rank_correlation_by_step": q.mean(1).tolist(),
-            "rank_correlation_returns": g.mean(1).tolist(),
-            "rank_correlation_returns_se": standard_error(g, episodes),
-            "rank_correlation_returns_training": rank_by_state(distiller, known, discount, rng)[
-                1].mean(1).tolist(),
-            "rank_correlation_episodes": len(np.unique(episodes))}
-
-
 # ---- Plans: `Returns` computes h_step_return.
 
 def homogeneous(params, *layers):
@@ -1369,11 +1329,12 @@ class FastPlanner(AgentPlanner):
     def returns_from(self, z):
         return self.fast.start(z, self.config) if self.fast else super().returns_from(z)
 
-    def search(self, z, mean):
-        mean, elites, scores = super().search(z, mean)
-        need(np.isfinite(scores).all(), "planning: no action sequence has a "
-             "finite return; the model's weights or the observation are far out of range")
-        return mean, elites, scores
+    def plan(self, latents):
+        actions = super().plan(latents)
+        need(np.isfinite(actions).all() and np.isfinite(self.mean).all(), "planning: no action "
+             "sequence has a finite return; the model's weights or the observation are far out of "
+             "range")
+        return actions
 
 
 # ==== 9. The same, in processes: workers plan for a part of the agents each ============
@@ -1436,9 +1397,9 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
 
     def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
         self.model, self.config, sequence = model, config, seed_sequence(seed)
-        need(config.prior == "last" or model.has_prior, "the model has no prior for plans to begin "
-             "from: it is a student distilled without, or an expert that has no policy; pass "
-             "--plan-prior last (evaluate: --prior last)")
+        need(config.prior == "last" or model.has_policy or model.config.prior_steps,
+             "the model has no prior for plans to begin from: it is a student distilled without, or "
+             "an expert without a policy; pass --plan-prior last (evaluate: --prior last)")
         self._parts = split_agents(model.config.num_agents, workers)
         own, *others = ((some_agents(model, part.start, part.stop), config)
                         for part in self._parts)
@@ -2119,22 +2080,20 @@ def teach_priors(distiller, task, planning, workers=None, environment=None):
     into by themselves, a quarter as many episodes a round as the expert's policy played. Then
     planning is taught back: what the student's search (`planning`) finds around the priors, in as
     many episodes of theirs. Returns the priors' weights {"policy": ..., "plans": ...}."""
-    student, expert, config = distiller.student, distiller.expert, distiller.config
+    student, config = distiller.student, distiller.config
     L, episodes = config.horizon + 1, -(-config.expert_episodes // 4)
+    reflex = dataclasses.replace(planning, prior="own", iterations=0)
 
     def own_states(number, teacher=None):
-        obs, *_, plans = play(
-            student, task, dataclasses.replace(planning, prior="own", iterations=0),
-            training_seeds(distiller.seed, "prior episode", number * episodes, episodes), workers,
-            "the priors play", environment, OWN_NOISE, teacher)
+        seeds = training_seeds(distiller.seed, "prior episode", number * episodes, episodes)
+        obs, *_, plans = play(student, task, reflex, seeds, workers, "the priors play", environment,
+                              OWN_NOISE, teacher)
         lived = np.isfinite(obs).all(2)
-        return obs[lived].T, plans[lived].T if teacher else None
+        return obs[lived].T, plans[lived].T
 
     def policy_at(obs):
-        with one_thread():
-            return [expert_features(distiller, obs), np.concatenate([
-                policy_plan(expert, part, L, student.config)
-                for part in np.array_split(obs, -(-obs.shape[1] // 512), 1)], 3)]
+        return in_parts(student.read, obs), in_parts(lambda part: policy_plan(
+            distiller.expert, part, L, student.config), obs)
 
     known = distiller.replay.sequences(distiller.train_starts, 1)[0]
     played = distiller.played[:, :distiller.replay.dim_obs].T.astype(F32)
@@ -2147,7 +2106,7 @@ def teach_priors(distiller, task, planning, workers=None, environment=None):
     if episodes:
         obs, plans = own_states(0, planning)
         plans = plans.reshape(student.config.num_agents, L, -1, obs.shape[1])
-        learn_priors(distiller, [(expert_features(distiller, obs), plans)], PRIOR_ROUNDS)
+        learn_priors(distiller, [(in_parts(student.read, obs), plans)], PRIOR_ROUNDS)
         taught["plans"] = prior_weights(student)
     return taught
 
@@ -2157,11 +2116,11 @@ def prior_weights(student):
     return {k: v.copy() for k, v in student.params.items() if k.startswith("_prior")}
 
 
-def expert_features(distiller, obs):
-    """What the student's encoders read of many observations (O, M): (1, F, M)."""
+def in_parts(function, obs):
+    """What a function makes of many observations (O, M): (..., M)."""
     with one_thread():
-        return np.concatenate([distiller.student.read(part) for part in np.array_split(
-            obs, -(-obs.shape[1] // 512), 1)], 2)
+        return np.concatenate([function(part) for part in np.array_split(
+            obs, -(-obs.shape[1] // 512), 1)], -1)
 
 
 def learn_priors(distiller, data, number):
@@ -2463,7 +2422,7 @@ def distil_and_save(distiller, args, planning, header, out):
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
     curve, seconds, before = train_student(distiller, out, settings, planning, args.workers)
-    ranks = rank_results(distiller, 256, planning.discount)
+    q, g = (ranks.tolist() for ranks in distiller.ranks(256, planning.discount))
     if finished:
         own, played = made_for(finished, path), finished.get("played", [])
         if planning.prior == own.get("prior") == "own":
@@ -2480,7 +2439,8 @@ def distil_and_save(distiller, args, planning, header, out):
     write_json(out / "config.json", {**settings, "planner": vars(planning)})
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
             "steps": config.steps, "seconds": round(seconds, 1), "seconds_total": before,
-            "kl_reward": curve[-1][3], "kl_value": curve[-1][4], **ranks, "played": played,
+            "kl_reward": curve[-1][3], "kl_value": curve[-1][4], "rank_correlation": q[0],
+            "rank_correlation_by_step": q, "rank_correlation_returns": g, "played": played,
             **{name: getattr(planning, name) for name in CHOSEN}, "out": str(out),
             "picture": drawn(draw_curve, out / "curve.png", curve,
                              f"{args.task}, seed {args.seed}")}, planning
@@ -2570,13 +2530,11 @@ def report(result, plannings):
                          f"{ms:.1f}", f"{result['plan_ms_expert'] / ms:.1f}"))
     print_table(rows)
     report_played(result)
-    q, g, known, error, held = (result[f"rank_correlation_{key}"] for key in (
-        "by_step", "returns", "returns_training", "returns_se", "episodes"))
-    spread = f"± {error[-1]:.3f}, standard error over {held} held-out episodes; " if error else ""
+    q, g = (result[f"rank_correlation_{key}"] for key in ("by_step", "returns"))
     kept = "-" if result["kept"] is None else f"{result['kept']:.2f}"
     print(f"\nreturn kept {kept}, rank correlation of Q {q[0]:.3f} (h = 0) to {q[-1]:.3f} (h = "
-          f"{len(q) - 1}), of the return {g[-1]:.3f} ({spread}{known[-1]:.3f} in training states), "
-          + "distilled in {seconds:.0f} s, {seconds_total:.0f} s in all, {out}/".format_map(result))
+          f"{len(q) - 1}), of the return {g[-1]:.3f}; Algorithm 1 took "
+          "{seconds:.0f} s, {seconds_total:.0f} s in all, {out}/".format_map(result))
 
 
 def report_played(result):
@@ -2714,9 +2672,6 @@ def make_parser():
     add("--episodes", type=positive, default=20, help="evaluation episodes [20]")
     add("--workers", type=natural, help="processes that play episodes; 0: this one [cores]")
     add_config(sub, DistillConfig)
-    for flag, name in (("--own-episodes", "expert_episodes"), ("--own-share", "played_share")):
-        add(flag, dest=f"DistillConfig.{name}", type=int, choices=[0],  # of earlier scripts
-            help=argparse.SUPPRESS)
     add_config(sub, PlannerConfig, "How the student plans; the expert does with its own defaults",
                "plan-", ("horizon", "action_repeat"), **STUDENT_PLANNING)
 

@@ -51,7 +51,7 @@ class Multitask(fac.WorldModel):
         k, (dim_obs, dim_action) = [*self.dims].index(task), self.dims[task]
         n = min(self.config.num_agents, dim_action)
         sizes = dataclasses.replace(self.config, dim_obs=dim_obs, dim_action=dim_action,
-                                    num_agents=n)
+                                    num_agents=n, prior_steps=int(teacher is not None))
         params = {key: value[:n] for key, value in self.params.items()}
         embedding, scale = (params.pop(key)[:, :, k] for key in (TASKS, SCALES))
         for name in ("_dynamics", "_reward", "_Q1", "_Q2"):  # no columns for actions it lacks
@@ -72,10 +72,6 @@ class OfTask(fac.WorldModel):
     """A student of one task, without priors of its own: plans may begin from what the policy of
     its `teacher` would do, whose latent stands below each agent's."""
     teacher = None
-
-    @property
-    def has_prior(self):
-        return self.teacher is not None
 
     def latents(self, obs, search=True):
         z = self.encode(obs)

@@ -230,14 +230,6 @@ def test_flags_go_before_the_preset(monkeypatch):
     assert (config.steps, config.kl, config.batch_size) == (7, "forward", 512)
 
 
-def test_earlier_scripts_may_say_that_students_play_no_episodes(monkeypatch, capsys):
-    config, *_ = configs_of(monkeypatch, "distill", "--own-episodes", 0, "--own-share", 0)
-    assert (config.expert_episodes, config.played_share) == (0, 0)
-    with pytest.raises(SystemExit, match="2"):
-        fac.main(["distill", "--own-episodes", "48"])
-    assert "--own-episodes: invalid choice" in capsys.readouterr().err
-
-
 def another_value(f):
     """Flags that set a field to something else, and that value."""
     flag = f.name.replace("_", "-")
@@ -960,16 +952,6 @@ def test_where_there_are_no_locks_a_run_goes_on(tmp_path, monkeypatch, missing):
         monkeypatch.setattr(fcntl, "flock", lambda *_: os.close(-1))  # an OSError
     with fac.locked(tmp_path / "a" / "b"), fac.locked(tmp_path / "a" / "b"):
         assert os.listdir(tmp_path / "a") == ["b"]
-
-
-def test_memory_that_is_not_there_is_refused_before_hours_of_work(tmp_path, files, capsys,
-                                                                  monkeypatch):
-    monkeypatch.setattr(fac, "memory", lambda: 10 ** 7)
-    monkeypatch.setattr(fac, "learning_numbers", lambda *_: 0)
-    monkeypatch.setattr(fac.Distiller, "step", None)
-    arguments = distill_arguments(files, "--plan-samples", "1000000", "--out", tmp_path / "out")
-    assert fac.main([str(a) for a in arguments]) == 2
-    assert "error: samples = 1000000: it would take about" in capsys.readouterr().err
 
 
 # evaluate and the record of the expert ------------------------------------------------

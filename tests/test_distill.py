@@ -73,6 +73,8 @@ def test_the_student_learns_the_experts_order(replay, settings):
         assert value.dtype == np.float32
         if key.startswith("_expert"):
             assert np.array_equal(value, weights[key[len("_expert"):]])
+        if key.startswith("_prior"):
+            assert np.array_equal(value, fresh.student.params[key]), "priors learn by themselves"
 
 
 def test_rank_correlation_of_the_expert_with_itself_is_one(replay):
@@ -80,40 +82,6 @@ def test_rank_correlation_of_the_expert_with_itself_is_one(replay):
     distiller.student = distiller.expert  # reads observations, as N = 1 does
     for of_q_or_return in distiller.ranks(64):
         assert of_q_or_return.shape == (4,) and np.allclose(of_q_or_return, 1, atol=1e-6)
-
-
-def test_the_ranks_of_a_result_say_in_which_states_and_of_how_many_episodes(replay, monkeypatch):
-    distiller, _ = distilled(replay, CONFIG, 0)
-    found = fac.rank_results(distiller, 64, 0.99)
-    q, g = distiller.ranks(64)
-    assert found["rank_correlation_by_step"] == q.tolist()
-    assert found["rank_correlation_returns"] == g.tolist()
-    assert found["rank_correlation"] == q[0] and found["rank_correlation_episodes"] == 2
-    monkeypatch.setattr(fac, "rank_by_state", lambda distiller, rows, *rest: (seen.append(rows), [
-        np.tile(np.searchsorted(replay.ends, rows) + 1.0, (4, 1))] * 2)[1])
-    for seed, held in ((0, {9, 19}), (1, {0, 10, 20}), (3, {2, 12, 22})):
-        seen = []
-        with contextlib.closing(fac.Distiller(distiller.expert, replay, CONFIG, seed=seed)) as one:
-            found = fac.rank_results(one, 64, 0.99)
-        of, known = (np.searchsorted(replay.ends, rows) for rows in seen)
-        assert set(of) == held and not set(known) & held and len(set(known)) > 10
-        assert found["rank_correlation_returns_training"] == [known.mean() + 1] * 4
-        assert found["rank_correlation_returns_se"] == fac.standard_error(
-            np.tile(of + 1.0, (4, 1)), of)
-
-
-def test_a_standard_error_is_of_groups_not_of_what_is_in_them():
-    rng, means, told = np.random.default_rng(0), [], []
-    groups = np.repeat(np.arange(6), 40)
-    for _ in range(400):
-        values = np.repeat(rng.standard_normal(6), 40) + 0.1 * rng.standard_normal(240)
-        means.append(values.mean())
-        told.append(fac.standard_error(values[None], groups)[0] ** 2)
-    assert np.mean(told) == pytest.approx(np.var(means), rel=0.2)
-    each = rng.standard_normal((3, 6))
-    np.testing.assert_allclose(fac.standard_error(np.repeat(each, 40, 1), groups),
-                               each.std(1, ddof=1) / np.sqrt(6))
-    assert fac.standard_error(each, np.zeros(6)) is None
 
 
 def test_rank_correlations_are_over_32_sequences_discounted_as_planned(replay, monkeypatch):
@@ -284,7 +252,7 @@ def test_the_expert_s_policy_plays_first_with_noise_and_once(replay, tmp_path, m
             assert len(distiller.lengths) == 3
     seeds = fac.training_seeds(0, "expert episode", 0, 3)
     assert len(set(seeds)) == 3 and len(seen) == 1
-    assert seen[0][1:] == ("policy", 0, seeds, 0.6) and seen[0][0].has_policy
+    assert seen[0][1:] == ("own", 0, seeds, 0.6) and seen[0][0].has_policy
 
 
 @pytest.mark.parametrize("clip", [True, False])
@@ -381,31 +349,6 @@ def test_a_step_in_halves_is_the_step_of_the_whole(replay, batch):
     np.testing.assert_allclose(seen[0], gradient, rtol=1e-3, atol=1e-5 * np.abs(gradient).max())
 
 
-def test_what_plans_gain_is_told_by_the_expert_and_promised_by_the_model(replay):
-    config = fac.PlannerConfig(prior="own", max_std=0.3, samples=64, iterations=3, pi_trajs=0)
-    obs = replay.observation[:16].T.astype(np.float32)
-    with fresh(replay, CONFIG) as distiller:
-        expert, student = distiller.expert, distiller.student
-    gain, promise = fac.plan_gains(expert, expert, config, obs)
-    assert gain.shape == (16,) and np.array_equal(gain, promise)  # its own G is the expert's
-    assert gain.mean() > 0 and (gain > 0).mean() > 0.8
-    still = fac.dataclasses.replace(config, iterations=0)
-    assert not np.any(fac.plan_gains(expert, expert, still, obs))
-    rng, z = np.random.default_rng(0), expert.encode(obs)
-    for key, value in student.params.items():  # one that knows nothing
-        if not key.startswith("_expert"):
-            value[:] = 0.3 * rng.standard_normal(value.shape)
-    lost, promised = fac.plan_gains(expert, student, config, obs)
-    assert promised.mean() > 0 and lost.mean() < gain.mean() / 2
-    assert not np.array_equal(lost, fac.plan_gains(expert, student, config, obs, 1)[0])
-    still = fac.dataclasses.replace(still, prior="last")  # whose plan is to do nothing
-    policy = fac.policy_rollout(expert, z, [np.float32(0)] * 4)[:, 0]
-    both = np.stack([np.zeros_like(policy), policy], -1)
-    G = fac.horizon_returns(*fac.predict(expert, z, both), config.discount)[-1]
-    np.testing.assert_allclose(fac.plan_gains(expert, student, still, obs)[0], G[:, 0] - G[:, 1],
-                               rtol=1e-4, atol=1e-5)
-
-
 def test_a_step_learns_at_its_rate_and_clips_its_gradient(replay, monkeypatch):
     config, seen = fac.dataclasses.replace(CONFIG, grad_clip=0.5), []
     with fresh(replay, config) as distiller:
@@ -473,34 +416,6 @@ def test_sizes_of_a_student():
     assert fac.student_config(expert, 12, "observation").expert_latent_dim == 0
 
 
-@pytest.mark.parametrize("name, settings", [
-    ("noise_samples", {"noise_samples": 10 ** 8}), ("batch_size", {"batch_size": 10 ** 8}),
-    ("horizon", {"horizon": 28, "noise_samples": 10}),
-    ("expert_episodes", {"expert_episodes": 10 ** 7}),
-    ("mlp_dim", {})])
-def test_memory_that_is_not_there_is_refused_before_it_is_taken(replay, monkeypatch, name,
-                                                                settings):
-    monkeypatch.setattr(fac, "memory", lambda: 5 * 10 ** 7)
-    more = {} if settings else {"mlp_dim": 10 ** 5}
-    config = fac.dataclasses.replace(CONFIG, **{"horizon": 3, **settings})
-    with pytest.raises(fac.UserError, match=f"^{name} = .* of memory, of 0.1 GB here; lower it"):
-        fac.Distiller(random_model(n=1, policy=True), replay, config, **more)
-
-
-@pytest.mark.parametrize("sizes", [{}, {"mlp_dim": 200}])
-def test_a_step_takes_about_the_memory_that_it_is_said_to(replay, sizes):
-    import tracemalloc
-    config = fac.dataclasses.replace(CONFIG, batch_size=128, noise_samples=10)
-    distiller = fac.Distiller(random_model(n=1, policy=True), replay, config, **sizes)
-    distiller.step()
-    tracemalloc.start()
-    distiller.step()
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    distiller.close()
-    assert 0.5 < 4 * fac.learning_numbers(distiller.student.config, 128 * 40) / peak < 3
-
-
 def test_what_learns_keeps_its_memory(replay):
     from numpy_learner import ExpertConfig, Learner
     for make in (lambda: fresh(replay, CONFIG), lambda: Learner(
@@ -557,7 +472,7 @@ def test_odd_settings_learn_all_the_same(replay, odd, n):
 def test_sizes_of_one_s_own_leave_what_the_encoder_reads(tmp_path, replay, encoder_input):
     expert = random_model(n=1, policy=True)
     config = fac.dataclasses.replace(CONFIG, encoder_input=encoder_input)
-    sizes = fac.student_config(expert.config, 3, encoder_input, True)
+    sizes = fac.student_config(expert.config, 3, encoder_input, 4)
     with contextlib.closing(fac.Distiller(expert, replay, config, mlp_dim=7)) as distiller:
         assert distiller.student.config == fac.dataclasses.replace(sizes, mlp_dim=7)
         distiller.step()
@@ -570,7 +485,11 @@ def test_an_expert_without_a_policy_says_so(replay):
     expert = random_model(n=1)
     with pytest.raises(fac.UserError, match="no policy.*--policy-share 0 --expert-episodes 0"):
         fac.Distiller(expert, replay, CONFIG)
-    fac.Distiller(expert, replay, fac.dataclasses.replace(CONFIG, policy_share=0.0)).close()
+    without = fac.dataclasses.replace(CONFIG, policy_share=0.0, priors=False)
+    for more in ({"policy_share": 0.5}, {"expert_episodes": 1}, {"priors": True}):
+        with pytest.raises(fac.UserError, match="no policy to learn from.*--no-priors"):
+            fac.Distiller(expert, replay, fac.dataclasses.replace(without, **more))
+    fac.Distiller(expert, replay, without).close()
 
 
 def test_part_one_is_at_most_700_lines_and_stands_alone():
@@ -605,7 +524,8 @@ def test_the_distiller_is_algorithm_1_in_less_time(replay, monkeypatch, num_agen
 
 def test_a_plain_step_takes_one_thread_as_every_other(replay, monkeypatch):
     from threadpoolctl import threadpool_limits
-    config = fac.dataclasses.replace(CONFIG, targets="joint", policy_share=0.0, reuse=1)
+    config = fac.dataclasses.replace(CONFIG, targets="joint", policy_share=0.0, reuse=1,
+                                     priors=False)
     seen = []
 
     def watched(*arguments):

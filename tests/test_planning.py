@@ -124,6 +124,8 @@ def test_an_elite_is_drawn_by_its_score_for_each_agent_alone():
     elites[:, 0] = np.arange(4) + 10 * np.arange(2)[:, None]  # 0 to 3, 10 to 13
     rngs = streams(2)
     drawn = np.array([fac.draw_elite(elites, scores, rngs) for _ in range(4000)])
+    assert drawn.shape == (4000, 2, 3, 2) and (drawn[:, :, 1:] == 9).all()  # whole sequences
+    drawn = drawn[:, :, 0]
     assert np.array_equal(drawn[:, :, 1], drawn[:, :, 0] + 10)  # both dimensions, of one elite
     for chosen, score in zip(drawn[:, :, 0].astype(int).T, scores):
         np.testing.assert_allclose(np.bincount(chosen, minlength=4) / 4000, score, atol=0.03)
@@ -187,7 +189,7 @@ def test_equation_2_written_out(horizon):
 def test_the_plain_return_can_be_planned_with(monkeypatch):
     """Who edits h_step_return sees it act; unedited it plans as the fast one does."""
     model, obs = random_model(), np.ones(8)
-    fast, plain = (fac.PlannerConfig(samples=64, iterations=2, returns=form, output="mean")
+    fast, plain = (fac.PlannerConfig(samples=64, iterations=2, speed=form, output="mean")
                    for form in ("fast", "plain"))
     first = fac.Planner(model, fast).act(obs)
     np.testing.assert_allclose(fac.Planner(model, plain).act(obs), first, atol=1e-3)
@@ -235,8 +237,8 @@ def test_what_is_executed_is_what_is_asked_for(output):
     planner.reset(np.random.SeedSequence(0).spawn(3))
     twin = [np.random.Generator(np.random.SFC64(s)) for s in np.random.SeedSequence(0).spawn(3)]
     mean, *elites = fac.mppi(fac.Returns(model).start(z, config), planner.mean, config, twin)
-    expected = mean[:, 0] if output == "mean" else fac.draw_elite(*elites, twin)
-    assert np.array_equal(planner.plan(z), expected)
+    expected = mean if output == "mean" else fac.draw_elite(*elites, twin)
+    assert np.array_equal(planner.plan(z), expected) and expected.shape == (3, 3, 1)
 
 
 @pytest.mark.parametrize("output", ["sampled", "mean"])
@@ -270,10 +272,11 @@ def test_noisy_actions_of_a_policy_are_clipped():
     assert np.abs(fac.policy_rollout(model, z, [np.float32(2)] * 3)).max() == 1
 
 
-def student_of(expert, agents=3, **sizes):
-    """A student that keeps the expert's encoder, policy and dynamics, its own weights alive."""
-    config = fac.dataclasses.replace(fac.student_config(expert.config, agents, "latent", True),
-                                     latent_dim=6, mlp_dim=24, **sizes)
+def student_of(expert, agents=3, prior_steps=4, **sizes):
+    """A student that reads the expert's latent and has priors, its own weights alive."""
+    sizes = {"latent_dim": 6, "mlp_dim": 24, **sizes}
+    config = fac.dataclasses.replace(fac.student_config(expert.config, agents, "latent",
+                                                        prior_steps), **sizes)
     student = fac.new_student(expert, config, 0)[1]
     rng = np.random.default_rng(3)
     for key, value in student.params.items():
@@ -282,41 +285,122 @@ def student_of(expert, agents=3, **sizes):
     return student
 
 
-def test_a_plan_of_no_iterations_is_what_the_policy_would_do(monkeypatch):
-    """And costs no more: nothing is rolled out in the model."""
-    monkeypatch.setattr(fac.WorldModel, "next", None)
+def written_out(student, obs):
+    """What a student's priors say, network by network, (N, L, d), of an observation (O,)."""
+    p, sizes = student.params, student.config
+    x = student.forward("_expert_encoder", obs[None, :, None])[0, :, 0]
+
+    def layer(name, i, x):
+        return p[f"{name}.weight"][i] @ x + p[f"{name}.bias"][i, :, 0]
+
+    e = layer("_prior_encoder.2", 0, fac.elu(layer("_prior_encoder.0", 0, x)))
+    plans = []
+    for i, own in enumerate(e.reshape(sizes.num_agents, sizes.latent_dim)):
+        for hidden in (0, 2):
+            own = fac.elu(layer(f"_prior.{hidden}", i, own))
+        plans.append(np.tanh(layer("_prior.4", i, own)).reshape(sizes.prior_steps, -1))
+    return np.stack(plans)
+
+
+def test_a_plan_of_no_iterations_is_what_the_prior_would_do(monkeypatch):
+    """An expert's is its policy; and it costs no more: nothing is rolled out in the model, or
+    encoded for it."""
     expert, obs = random_model(1, policy=True), np.linspace(-1, 1, 8, dtype=np.float32)
+    student, config = student_of(expert), fac.PlannerConfig(prior="own", iterations=0)
+    for key in [*student.params]:
+        if key.startswith(("_encoder", "_dynamics", "_reward", "_Q")):
+            student.params[key] = np.full_like(student.params[key], np.nan)
+    monkeypatch.setattr(fac, "mppi", None)
+    monkeypatch.setattr(fac.WorldModel, "next", None)
     z = expert.encode(obs[:, None])
-    for model in (expert, student_of(expert)):
-        config = fac.PlannerConfig(prior="own", iterations=0)
-        assert np.array_equal(fac.Planner(model, config).act(obs), expert.policy(z)[0, :, 0])
+    for model, expected in ((expert, expert.policy(z)[0, :, 0]),
+                            (student, written_out(student, obs)[:, 0, 0])):
+        for one in (config, fac.dataclasses.replace(config, horizon=0, output="mean")):
+            with fac.Planner(model, one) as planner:
+                plan, action = planner.plan(obs), planner.act(obs)
+                assert np.array_equal(planner.act(obs), action)  # no mean is moved on
+            assert plan.shape == (model.config.num_agents, 1, model.config.agent_actions)
+            assert np.array_equal(plan.ravel(), action)
+            np.testing.assert_allclose(action, expected, atol=1e-5)
         assert not fac.Planner(model, fac.PlannerConfig(iterations=0)).act(obs).any()
 
 
+@pytest.mark.parametrize("agents", [1, 3])
+def test_a_reflex_is_the_prior_s_first_action_bit_for_bit_with_any_workers(agents):
+    student = student_of(random_model(1, 6, policy=True), agents)
+    reflex = fac.PlannerConfig(prior="own", iterations=0)
+    for obs in np.random.default_rng(1).standard_normal((3, 8)).astype(np.float32):
+        prior = student.prior(student.latents(obs[:, None], False), 1)[..., 0]
+        assert prior.shape == (agents, 1, 6 // agents) and prior.any()
+        np.testing.assert_allclose(prior, written_out(student, obs)[:, :1], atol=1e-5)
+        whole = student.prior(student.latents(obs[:, None]), 4)[..., 0]
+        assert np.array_equal(prior, whole[:, :1])  # whether the agents search or not
+        for workers in range(min(3, agents)):
+            with fac.Planner(student, reflex, workers=workers) as planner:
+                assert np.array_equal(planner.plan(obs), prior)
+                assert np.array_equal(planner.act(obs), prior.ravel())
+
+
+def test_a_prior_names_its_steps_and_then_its_last_one_again():
+    student, obs = student_of(random_model(1, policy=True)), np.ones(8, np.float32)
+    latents, expected = student.latents(obs[:, None]), written_out(student, obs)
+    assert np.abs(np.diff(expected, axis=1)).min() > 1e-4
+    for steps in (1, 4, 6):
+        found = student.prior(latents, steps)[..., 0]
+        rows = np.minimum(np.arange(steps), 3)
+        np.testing.assert_allclose(found, expected[:, rows], atol=1e-5)
+
+
 @pytest.mark.parametrize("output", ["sampled", "mean"])
-def test_a_search_around_the_policy_starts_there_every_time(output):
-    """In each agent's own part of the expert's rollout, with the first deviation for width."""
-    expert = random_model(1, policy=True)
-    student, seen = student_of(expert), []
+def test_a_search_around_the_prior_starts_there_every_time(output):
+    """In each agent's own plan, an expert's policy rolled out, with the first deviation for
+    width."""
+    expert, obs = random_model(1, policy=True), np.full(8, 0.3, np.float32)
+    student = student_of(expert)
     config = fac.PlannerConfig(prior="own", samples=400, iterations=1, min_std=0.01,
-                               max_std=0.01, horizon=2, output=output)
-    planner, obs = fac.Planner(student, config), np.full(8, 0.3, np.float32)
-    start = planner.own.fast.start
-    planner.own.fast.start = lambda *args: (
-        lambda G: lambda actions: seen.append(actions) or G(actions))(start(*args))
+                               max_std=0.01, horizon=2, output=output, pi_trajs=0)
     rollout = fac.policy_rollout(expert, expert.encode(obs[:, None]), [np.float32(0)] * 3)
-    for _ in range(2):
-        planner.act(obs)
-    for actions in seen:  # (N, L, 1, S)
-        assert np.abs(actions.mean(-1)[..., 0] - rollout[:, 0, :, 0].T).max() < 0.01
-        assert actions.std(-1).max() < 0.015
+    for model, expected in ((student, written_out(student, obs)[:, :3]),
+                            (expert, rollout[:, 0, :, 0][None])):
+        planner, seen = fac.Planner(model, config), []
+        start = planner.own.fast.start
+        planner.own.fast.start = lambda *args: (
+            lambda G: lambda actions: seen.append(actions) or G(actions))(start(*args))
+        for _ in range(2):
+            planner.act(obs)
+        assert len(seen) == 2 and np.abs(expected).max() > 0.1
+        for actions in seen:  # (N, L, d, S)
+            assert np.abs(actions.mean(-1) - np.clip(expected, -1, 1)).max() < 0.01
+            assert actions.std(-1).max() < 0.015
 
 
-def test_a_policy_to_start_from_is_needed():
+def test_a_prior_to_start_from_is_needed():
     for model in (random_model(1), random_model(3), student_of(random_model(1, policy=True),
-                                                               expert_mlp_dim=0)):
-        with pytest.raises(fac.UserError, match="no policy of an expert.*--plan-prior last"):
+                                                               prior_steps=0)):
+        with pytest.raises(fac.UserError, match="no prior for plans.*--plan-prior last"):
             fac.Planner(model, fac.PlannerConfig(prior="own"))
+
+
+def test_a_student_s_latents_are_its_agents_and_below_them_what_priors_read():
+    """A search reads the first half alone, a reflex the second alone."""
+    expert, obs = random_model(1, policy=True), np.random.default_rng(2).standard_normal((8, 5))
+    student, plain = student_of(expert), student_of(expert, prior_steps=0)
+    latents, reflex = student.latents(obs), student.latents(obs, False)
+    assert latents.shape == (3, 12, 5) and np.array_equal(latents[:, 6:], reflex)
+    assert np.array_equal(latents[:, :6], student.encode(obs))
+    for model in (expert, plain):
+        for search in (True, False):
+            assert np.array_equal(model.latents(obs, search), model.encode(obs))
+    latents, config = latents[..., :1], fac.PlannerConfig(samples=16, iterations=1, prior="own")
+    planner, plans = fac.FastPlanner(student, config), []
+    for spoil, moved in ((slice(0), False), (slice(6), True), (slice(6, 12), True)):
+        spoilt = latents.copy()
+        spoilt[:, spoil] += 1
+        planner.reset(np.random.SeedSequence(0).spawn(3))
+        plans.append(planner.plan(spoilt))
+        assert np.array_equal(plans[-1], plans[0]) != moved
+        assert np.array_equal(student.prior(spoilt, 4), student.prior(latents, 4)) != (
+            spoil == slice(6, 12))
 
 
 def test_an_observation_of_the_wrong_size_is_refused():
@@ -338,6 +422,7 @@ def test_planner_config_refuses_nonsense():
                         ({"min_std": 3.0}, r"min_std must be at most max_std \(2.0\)"),
                         ({"discount": 1.1}, "at least 0 and at most 1"),
                         ({"samples": 64.0}, "samples must be of type int, not 64.0"),
+                        ({"samples": 10 ** 8}, "at least 1 and at most 1000000"),
                         ({"discount": True}, "of type float"), ({"output": None}, "of type str"),
                         ({"inverse_temperature": 1e40}, "finite, as a float32")):
         with pytest.raises(fac.UserError, match=text):
@@ -355,14 +440,43 @@ def shared_memory():
     return sorted(name for name in names if name.startswith(("psm_", "sem.mp-")))
 
 
-def test_workers_begin_where_the_policy_does():
+@pytest.mark.parametrize("search", [
+    {"samples": 32, "iterations": 2, "max_std": 0.2}, {"iterations": 0}])
+def test_workers_begin_where_their_agents_priors_do(search):
     student = student_of(random_model(1, policy=True))
-    config = fac.PlannerConfig(samples=32, iterations=2, prior="own", max_std=0.2)
+    config = fac.PlannerConfig(prior="own", **search)
     obs, plans = np.random.default_rng(1).standard_normal((3, 8)), []
     for workers in (0, 1, 2):
         with fac.Planner(student, config, 0, workers) as planner:
-            plans.append([planner.act(o) for o in obs])
+            plans.append([planner.plan(o) for o in obs])
     assert np.array_equal(plans[0], plans[1]) and np.array_equal(plans[0], plans[2])
+    assert np.shape(plans[0]) == (3, 3, 4 if config.iterations else 1, 1)
+
+
+@pytest.mark.parametrize("iterations", [0, 1])
+def test_a_worker_has_its_agents_networks_and_is_sent_their_latents_alone(monkeypatch, iterations):
+    """Nothing of the expert, of an encoder, or of another agent."""
+    student, sent = student_of(random_model(1, policy=True)), []
+    obs, send_all = np.ones(8, np.float32), fac.Workers.send_all
+    config = fac.PlannerConfig(samples=8, iterations=iterations, prior="own")
+
+    def watched(self, messages):
+        sent.append([*messages])
+        send_all(self, sent[-1])
+
+    monkeypatch.setattr(fac.Workers, "send_all", watched)
+    with fac.Planner(student, config, workers=2) as planner:
+        planner.act(obs)
+    ((first, _), (second, _)), _, latents = sent  # models, seeds, latents
+    whole = student.latents(obs[:, None], iterations > 0)
+    assert [*map(np.shape, latents)] == [(1, 12 if iterations else 6, 1)] * 2
+    assert np.array_equal(np.concatenate(latents), whole[1:])
+    names = {name for name, *_ in fac.networks(student.config)}
+    shared = {"_encoder", "_prior_encoder", "_expert_encoder"}
+    for i, model in ((1, first), (2, second)):
+        assert {key.split(".")[0] for key in model.params} == names - shared
+        for key, value in model.params.items():
+            assert np.array_equal(value, student.params[key][i:i + 1])
 
 
 @pytest.mark.parametrize("n, d, workers", [(3, 1, 1), (3, 1, 2), (2, 3, 1), (6, 1, 3)])
@@ -446,38 +560,6 @@ def test_what_is_no_number_of_episodes_or_workers_is_refused(count):
     if count != 10 ** 9:
         with pytest.raises(fac.UserError, match="workers: expected a whole number from 0"):
             fac.play(random_model(), "reacher-easy", fac.PlannerConfig(), [1], count)
-
-
-def test_memory_that_is_not_there_is_refused_before_it_is_taken(monkeypatch):
-    """In one line that names the setting, here the one furthest above its default."""
-    model = random_model()
-    for config, part in ((fac.PlannerConfig(samples=10_000, horizon=499), "horizon = 499: it wou"),
-                         (fac.PlannerConfig(samples=10 ** 6), "samples = 1000000: it would take"),
-                         (fac.PlannerConfig(samples=4, pi_trajs=10 ** 6), "pi_trajs = 1000000: ")):
-        with monkeypatch.context() as patch:
-            patch.setattr(fac, "memory", lambda: 10 ** 7)
-            with pytest.raises(fac.UserError, match=part):
-                fac.Planner(model, config)
-            patch.setattr(fac, "memory", lambda: 10 ** 13)
-            fac.Planner(model, config)
-    with pytest.raises(fac.UserError, match="samples must be at least 1 and at most 1000000"):
-        fac.PlannerConfig(samples=10 ** 8)
-
-
-def test_a_plan_takes_about_the_memory_that_it_is_said_to():
-    import tracemalloc
-    small, large = fac.ModelConfig(8, 21, 21, 50, 256, 50), fac.ModelConfig(8, 6, 1, 50, 256, 512)
-    for sizes, samples, returns in ((small, 4000, "fast"), (large, 512, "fast"),
-                                    (large, 1000, "plain")):
-        config = fac.PlannerConfig(samples=samples, returns=returns, iterations=1)
-        with fac.one_thread():
-            planner = fac.Planner(fac.WorldModel.create(sizes, np.random.default_rng(0)), config)
-        planner.act(np.zeros(8))
-        tracemalloc.start()
-        planner.act(np.zeros(8))
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        assert 0.5 < 4 * fac.planning_numbers(sizes, config) / peak < 3
 
 
 def test_a_dead_worker_is_reported_and_nothing_hangs():
