@@ -1150,10 +1150,21 @@ class Distiller:
         self.played, self.lengths, self._number = played, state["lengths"], None
 
     def ranks(self, states, discount=0.99):
-        """The means of `rank_by_state` over so many held-out states, drawn evenly: two (L,)."""
-        rng = stream(self.seed, "rank correlation")
+        """Spearman's correlation of student and expert over 32 perturbed action sequences, mean
+        over so many held-out states, drawn evenly: of the global Q at each step h, and of G
+        (Equation 2), by which planning ranks, for each H; two (L,). 1 is the same order, as for a
+        loss of 0 (4.4)."""
+        rng, student = stream(self.seed, "rank correlation"), self.student
+        config = dataclasses.replace(self.config, noise_samples=32, targets="joint")
         rows = rng.choice(self.held_out_starts, states)
-        return tuple(ranks.mean(-1) for ranks in rank_by_state(self, rows, discount, rng))
+        obs, actions = self.replay.sequences(rows, config.horizon + 1)
+        with one_thread():
+            x, actions, expert = self.perturb(self.expert, student, obs, actions[..., None], config,
+                                              rng)
+            found = predict(student, student.encode_features(x), actions)
+        G = (horizon_returns(*out, discount) for out in (expert, found))
+        return (spearman(expert[1] + expert[2], found[1] + found[2]).mean(-1),
+                spearman(*G).mean(-1))
 
     def close(self):
         """Stop the threads."""
@@ -1203,21 +1214,6 @@ def horizon_returns(rewards, q1, q2, discount):
         found.append(rewarded + discount ** h * q)
         rewarded = rewarded + discount ** h * reward
     return np.stack(found)
-
-
-def rank_by_state(distiller, rows, discount, rng):
-    """Spearman's correlation of student and expert over 32 perturbed action sequences in the states
-    of the replay's `rows` (B,): of the global Q at each step h, and of G (Equation 2), by which
-    planning ranks, for each H; two (L, B). 1 is the same order, as for a loss of 0 (4.4)."""
-    student, config = distiller.student, dataclasses.replace(
-        distiller.config, noise_samples=32, targets="joint")
-    obs, actions = distiller.replay.sequences(rows, config.horizon + 1)
-    with one_thread():
-        x, actions, expert = distiller.perturb(distiller.expert, student, obs, actions[..., None],
-                                               config, rng)
-        found = predict(student, student.encode_features(x), actions)
-    return (spearman(expert[1] + expert[2], found[1] + found[2]),
-            spearman(*(horizon_returns(*out, discount) for out in (expert, found))))
 
 
 # ---- Plans: `Returns` computes h_step_return.
@@ -1398,8 +1394,8 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
     def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
         self.model, self.config, sequence = model, config, seed_sequence(seed)
         need(config.prior == "last" or model.has_policy or model.config.prior_steps,
-             "the model has no prior for plans to begin from: it is a student distilled without, or "
-             "an expert without a policy; pass --plan-prior last (evaluate: --prior last)")
+             "the model has no prior for plans to begin from: it is a student distilled without, "
+             "or an expert without a policy; pass --plan-prior last (evaluate: --prior last)")
         self._parts = split_agents(model.config.num_agents, workers)
         own, *others = ((some_agents(model, part.start, part.stop), config)
                         for part in self._parts)
@@ -2008,7 +2004,7 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
                       for w in range(workers))
         for i in range(E):
             episodes.append(pool.receive(i % workers) if workers else next(here))
-            total += sum(reward for *_, reward, _ in episodes[i])
+            total += sum(decision[2] for decision in episodes[i])
             bar.update()
             bar.set_postfix_str(f"mean return {total / (i + 1):.0f}", False)
     T = max(map(len, episodes), default=0)

@@ -84,10 +84,9 @@ def test_a_grouping_learns_and_plans_as_the_plain_cut_of_a_permuted_robot(tmp_pa
     assert np.allclose(losses, theirs[1], rtol=1e-3) and np.allclose(ranks, theirs[2], atol=0.02)
 
     # the same weights, so that rounding in learning doesn't matter: whole episodes are the same
-    params = {**grouped.student.params, **{k: v for k, v in plain.student.params.items()
-                                           if k.startswith("_expert")}}
-    twin = fac.WorldModel(plain.student.config, params)
-    for prior in ("policy", "none"):
+    twin = fac.WorldModel(plain.student.config, {**grouped.student.params, **{
+        k: v for k, v in plain.student.params.items() if k.startswith("_expert")}})
+    for prior in ("own", "last"):
         config = dataclasses.replace(around, prior=prior)
         ours = fac.play(grouped.student, None, config, [3, 4], environment=Robot())
         theirs = fac.play(twin, None, config, [3, 4], environment=Robot(ORDER))
@@ -108,7 +107,7 @@ def test_a_grouping_learns_and_plans_as_the_plain_cut_of_a_permuted_robot(tmp_pa
 
 
 def test_what_is_told_of_joints_is_told_in_the_robot_s_order(tmp_path):
-    """agreement's ranks by joint, plans' gains and figure 9's credit."""
+    """agreement's ranks by joint, what the policy would do and figure 9's credit."""
     expert = random_model(1, 4, policy=True)
     plain = random_model(2, 4, seed=1)
     grouped = fac.WorldModel(dataclasses.replace(plain.config, groups=GROUPS), plain.params)
@@ -129,9 +128,9 @@ def test_what_is_told_of_joints_is_told_in_the_robot_s_order(tmp_path):
     theirs = look.agreement(plain, permuted(expert), obs, actions[ORDER], Values(ORDER))
     assert np.allclose(ours[ORDER], theirs, atol=0.02)
     config = fac.PlannerConfig(samples=8, iterations=1)
-    gains = (fac.plan_gains(expert, grouped, config, obs),
-             fac.plan_gains(permuted(expert), plain, config, obs))
-    assert np.allclose(*gains, atol=1e-3)
+    plans = (fac.policy_plan(expert, obs, 4, grouped.config),
+             fac.policy_plan(permuted(expert), obs, 4, plain.config))
+    assert plans[0].shape == (2, 4, 2, 6) and np.allclose(*plans, atol=1e-4)
     episode = rng.standard_normal((9, 8)).astype(np.float32), rng.uniform(-1, 1, (9, 4))
     assert np.allclose(look.credit(grouped, *episode, config),
                        look.credit(plain, episode[0], episode[1][:, ORDER], config))
