@@ -797,8 +797,14 @@ def report_students(_, path, figures):
         row for own in settled(path, VARIED["students"], False).values() for row in own)
     result, text = students.table(lines, {
         task: f"{found[1]} / {found[0]}" for task, found in AUTHORS.items()})
-    short = (students.readme_table(lines, result, paper) for paper in (True, False))
-    return result, "\n".join([*short, text, students.search_table(lines)])
+    return result, "\n".join([text, students.search_table(lines)])
+
+
+def report_alone(_, path, figures):
+    """Students whose joints have priors of their own, `students --out results/alone.csv`."""
+    rows = [row for own in settled(path, VARIED["students"], False).values() for row in own]
+    short, table = students.alone_tables(students.by_line(rows))
+    return {"runs": len(rows)}, f"{short}\n{table}"
 
 
 REPORT_HEAD = """# The paper's figures, here
@@ -815,9 +821,9 @@ agents have 26%. One agent's layers are as wide as its expert's, N agents' an Nt
 13: latents of 50 an agent, so 50 N in all. Minutes are of a core while others distil beside it.
 
 """
-REPORTS = {"students": report_students, "figure4": report_curves, "figure5": report_curves,
-           "figure7": report_figure7, "figure8": report_figure8, "figure12": report_curves,
-           "figure13": report_curves, "departures": report_curves}
+REPORTS = {"alone": report_alone, "students": report_students, "figure4": report_curves,
+           "figure5": report_curves, "figure7": report_figure7, "figure8": report_figure8,
+           "figure12": report_curves, "figure13": report_curves, "departures": report_curves}
 
 
 def command_report(args):
@@ -832,7 +838,8 @@ def command_report(args):
             except (LookupError, ValueError, TypeError, StopIteration) as odd:
                 raise fac.UserError(f"{results / name}.csv: not {name}'s rows ({odd!r})") from None
             title = name.replace("figure", "Figure ").capitalize()
-            picture = f"![]({figures_from}/{name}.png)\n" if name != "students" else ""
+            drawn = name not in ("alone", "students")
+            picture = f"![]({figures_from}/{name}.png)\n" if drawn else ""
             text.append(f"## {title}\n\n{table}\n{picture}")
     fac.need(result, f"{results}: no runs there; make some, e.g. with 'experiments.py figure4'")
     with fac.atomic_file(results / "report.md", "w", encoding="utf-8") as file:

@@ -8,9 +8,9 @@ import numpy as np
 import fac_tdmpc_ref as fac
 from tables import deviation, markdown, of_returns
 
-EVALUATION_SEEDS = (0, 1)
+EVALUATION_SEEDS = (101, 102)  # which nothing was chosen by
 MEASURED = ("rank_correlation", "plan_ms", "same_search_returns",  # of result.json, in a row
-            "samples", "iterations")
+            "reflex_returns", "played", *fac.CHOSEN)
 KEPT, WINS = "kept, evaluation seeds 0 / 1", "planning wins, expert / student"
 FASTER = "speed-up, one core: over expert / the same search"
 HEADS = ("seeds", "MPPI", "student", KEPT, "least kept", WINS,
@@ -75,7 +75,7 @@ def wins(rows, key="returns", over="policy_returns"):
     over students, as if these were apart. rows: {evaluation seed: rows by seed}"""
     found = np.concatenate([
         [np.subtract(returns(row, key), returns(row, over)) for row in rows[seed]]
-        for seed in EVALUATION_SEEDS], 1)  # (students, episodes)
+        for seed in sorted(rows)], 1)  # (students, episodes)
     errors = [x.std(ddof=1) / len(x) ** 0.5 for x in (found.mean(0), found.mean(1)) if len(x) > 1]
     return f"{found.mean():.0f} ± {np.hypot.reduce(errors):.0f}"
 
@@ -87,9 +87,9 @@ def measured(rows, of):
 
 def cells(rows):
     """A line's HEADS, of {evaluation seed: rows by seed}."""
-    if not all(rows[seed] for seed in EVALUATION_SEEDS):
+    if len(rows) < 2:
         return ["-"] * len(HEADS)
-    first, students = rows[0], sum(rows.values(), [])
+    first, students = rows[min(rows)], sum(rows.values(), [])
     same = [row for row in students if returns(row, "same_search_returns")]
     faster = (measured(of, lambda x, key=key: x[key]) /
               measured(of, lambda x: x["plan_ms_student_in_process"])
@@ -99,7 +99,7 @@ def cells(rows):
         "{samples} x {iterations}".format_map(json.loads(row["ranks"])) for row in first))
     means = [float(row["return_mean"]) for row in first]
     return [len(first), budget, mean_and_spread(means, deviation),
-            " / ".join(f"{kept(rows[seed]):.2f}" for seed in EVALUATION_SEEDS),
+            " / ".join(f"{kept(rows[seed]):.2f}" for seed in sorted(rows)),
             f"{min(kept([row]) for row in students):.2f}",
             " / ".join(wins(rows, key) for key in ("expert_returns", "returns"))
             if all(returns(row, "policy_returns") for row in students) else "-",
@@ -121,8 +121,8 @@ def by_line(rows):
     """{line: {evaluation seed: rows by seed}}."""
     found = {}
     for row in rows:
-        found.setdefault(line_of(row), {seed: [] for seed in EVALUATION_SEEDS})[
-            int(row["evaluation_seed"])].append(row)
+        found.setdefault(line_of(row), {}).setdefault(
+            int(row["evaluation_seed"]), []).append(row)
     return found
 
 
@@ -141,23 +141,6 @@ def table(lines, authors):
                             [found.values() for found in result.values()])
 
 
-def readme_table(lines, result, paper=True):
-    """The README's: the default of each of the paper's tasks, or of the others, and what its plain
-    preset keeps. Returns are means over seeds and episodes of both evaluation seeds. result:
-    `table`'s."""
-    found = []
-    for task, rows in lines.items():
-        own = sum(rows.values(), [])
-        if (task in fac.TASKS) == paper and task == own[0]["task"] and all(
-                returns(row, "policy_returns") for row in own):
-            means = (overall(own, key) for key in ("expert_returns", "policy_returns", "returns"))
-            found.append([task, result[task]["N"], *(f"{x:.0f}" for x in means),
-                          *(result[task][head] for head in (KEPT, WINS, FASTER)),
-                          result.get(f"{task}, plain", {}).get(KEPT, "-")])
-    return markdown(["task", "N", "expert", "its policy alone", "student", KEPT, WINS, FASTER,
-                     "`--preset plain` keeps"], found)
-
-
 def search_table(lines):
     """The expert searching like its student, beside both: mean returns as the README's, and
     milliseconds of a decision in one process."""
@@ -166,9 +149,45 @@ def search_table(lines):
     heads, found = ("the expert", "its policy alone", "the same search", "student"), []
     for line, rows in lines.items():
         own = sum(rows.values(), [])
-        if all(rows.values()) and all(returns(row, key) for row in own for key in keys):
+        if len(rows) > 1 and all(returns(row, key) for row in own for key in keys):
             ms = (measured(own, lambda x, key=f"plan_ms_{who}": x[key]) for who in timed)
             found.append([line, *(f"{overall(own, key):.0f}" for key in keys),
                           wins(rows, over="same_search_returns"), *(f"{x:.1f}" for x in ms)])
     return markdown(["task", *heads, "student - the same search", *(f"ms: {x}" for x in heads)],
                     found)
+
+
+def alone_tables(lines):
+    """What each joint wins alone: the README's table, and all of it. Mean returns over students and
+    episodes of all evaluation seeds: the expert, its policy alone, the student's priors alone, the
+    student with the search that it chose by playing (it may be none), the expert in the same
+    search; ± standard error over episodes of the student's difference from the expert's."""
+    short, whole = [], []
+    for line, rows in lines.items():
+        own = sum(rows.values(), [])
+        about = [json.loads(row["ranks"]) for row in own]
+        for row, of in zip(own, about):  # a student that doesn't search is its priors
+            row["reflex_returns"] = json.dumps(of.get("reflex_returns", returns(row)))
+            row["same_returns"] = json.dumps(of.get("same_search_returns",
+                                                    returns(row, "policy_returns")))
+        expert, policy, reflex, student, same = (f"{overall(own, key):.0f}" for key in (
+            "expert_returns", "policy_returns", "reflex_returns", "returns", "same_returns"))
+        gap = np.concatenate([np.subtract(returns(row), returns(row, "expert_returns"))
+                              for row in own])
+        error = gap.std(ddof=1) / len(gap) ** 0.5
+        search = " / ".join(dict.fromkeys(
+            "{samples} x {iterations}, {max_std}".format_map(of) if of["iterations"] else "none"
+            for of in about))
+        ms = [np.mean([of[f"plan_ms_{who}"] for of in about])
+              for who in ("expert", "student_in_process")]
+        agents, minutes = json.loads(own[0]["settings"])["num_agents"], float(own[0]["minutes"])
+        short.append([f"{line}, N = {agents}", expert, policy, f"{student} ± {error:.0f}", search,
+                      f"{ms[0] / ms[1]:.0f}"])
+        whole.append([line, agents, len(about), expert, policy, reflex, student, same,
+                      f"{kept(own):.2f} ± {error / overall(own, 'expert_returns'):.2f}", search,
+                      *(f"{x:.1f}" for x in ms), f"{minutes:.0f}"])
+    return (markdown(["task", "expert", "its policy alone", "student", "its search",
+                      "times as fast"], short),
+            markdown(["task", "N", "rows", "expert", "its policy alone", "priors alone", "student",
+                      "expert, same search", "kept", "its search", "ms: expert", "ms: student",
+                      "minutes of Algorithm 1"], whole))

@@ -150,7 +150,7 @@ except SystemExit as end:
 @pytest.mark.parametrize("command, expected", [
     ((), ["distill", "evaluate"]),
     (("distill",), ["--task", "--preset", "--num-agents", "--evaluate-expert", "--plan-samples",
-                    "[14000; paper: 100000]", "[forward; paper: reverse]", "reacher-hard"]),
+                    "[7000; paper: 100000]", "[forward; paper: reverse]", "reacher-hard"]),
     (("evaluate",), ["--model", "--record", "--samples", "--output", "[4; paper: 6]"])])
 def test_help_is_quick_and_starts_nothing(tmp_path, command, expected):
     done = succeeded(launch(["-c", WATCHED, *command, "--help"], tmp_path))
@@ -201,11 +201,11 @@ def test_preset_paper_is_the_paper(monkeypatch):
                 "lr_schedule": "constant", "warmup": 0, "grad_clip": 10,
                 "noise_std": 0.5, "clip_actions": False,
                 "reuse": 1, "expert_episodes": 0, "played_share": 0, "policy_share": 0,
-                "targets": "joint"}
+                "targets": "joint", "priors": False}
     assert {k: found[k] for k in expected} == expected
     assert (planner.samples, planner.iterations, planner.num_elites, planner.pi_trajs,
             planner.horizon, planner.discount) == (512, 6, 64, 24, 3, 0.99)
-    assert (planner.prior, planner.max_std, planner.output) == ("none", 2.0, "mean")
+    assert (planner.prior, planner.max_std, planner.output) == ("last", 2.0, "mean")
 
 
 def test_preset_plain_is_the_paper_s_method_at_our_budget(monkeypatch):
@@ -213,7 +213,7 @@ def test_preset_plain_is_the_paper_s_method_at_our_budget(monkeypatch):
     config, planner = configs_of(monkeypatch, "distill", "--preset", "plain")
     changed = {k: v for k, v in dataclasses.asdict(config).items() if v != getattr(ours, k)}
     assert changed == {"targets": "joint", "policy_share": 0, "expert_episodes": 0,
-                       "played_share": 0, "noise_std": 0.5}
+                       "played_share": 0, "noise_std": 0.5, "priors": False}
     assert planner == fac.PlannerConfig()
 
 
@@ -251,7 +251,7 @@ def test_every_flag_reaches_its_setting(monkeypatch, config_class, prefix, start
             continue  # distill has one for loss and planning; a model's file says it
         (flag, *rest), value = another_value(f)
         if prefix and f.name == "prior":
-            rest, value = ["none"], "none"
+            rest, value = ["last"], "last"
         flag = f"--no-{prefix}{flag[3:]}" if flag.startswith("no-") else f"--{prefix}{flag}"
         found = next(c for c in configs_of(monkeypatch, *start, flag, *rest)
                      if isinstance(c, config_class))
@@ -293,7 +293,7 @@ def refused(done, *parts, program="fac_tdmpc_ref.py"):
     (["--noise-std", "nan"], ["noise_std", "nan"]),
     (["--lr", "inf"], ["lr", "finite"]),
     (["--expert-episodes", "1", "--played-share", "0"], ["played_share", "above 0", "not 0.0"]),
-    (["--encoder-input", "observation"], ["no policy", "--plan-prior last"]),
+    (["--no-priors", "--plan-prior", "own"], ["no prior", "--plan-prior last"]),
     (["--held-out", "1"], ["held_out", "at least 0.0001 and at most 0.5"]),
     (["--horizon", "40"], ["replay.npz", "two episodes of at least 41 actions"]),
     (["--kl", "sideways"], ["--kl", "'sideways'", "forward"]),
@@ -408,73 +408,124 @@ def test_distill_prints_json_and_a_table(distilled):
     assert "horizon 3 and 1" in table and "128 x 4" in table and "16 x 1" in table
     policy = np.mean(result["policy_returns"])
     assert len(result["policy_returns"]) == 1 and f"{policy:.0f} ± 0" in table
-    (line,) = [line for line in table.splitlines() if "searching like its student" in line]
-    ms, experts = result["plan_ms_same_search"], result["plan_ms_expert"]
-    assert line.split()[-8:] == ["16", "x", "1", f"{result['same_search_return_mean']:.0f}", "±",
-                                 "0", f"{ms:.1f}", f"{experts / ms:.1f}"]
+    for label, key in (("searching like its student", "same_search"),
+                       ("student, N = 3, its priors alone", "reflex")):
+        (line,) = [line for line in table.splitlines() if label in line]
+        ms, experts = result[f"plan_ms_{key}"], result["plan_ms_expert"]
+        budget = ["16", "x", "1"] if key == "same_search" else ["alone", "0"]
+        assert line.split()[-5 - len(budget):] == [
+            *budget, f"{result[f'{key}_return_mean']:.0f}", "±", "0", f"{ms:.1f}",
+            f"{experts / ms:.1f}"]
     header, _ = fac.read_npz(folder / "student.npz", ("student",))
-    gain, error = result["wide_search_gain"]
-    width = (fac.WIDE_SEARCH if gain > 3 * error else fac.STUDENT_PLANNING)["max_std"]
-    planning = fac.PlannerConfig(**{**fac.STUDENT_PLANNING, "samples": 16, "iterations": 1,
-                                    "max_std": width})
+    planning = fac.PlannerConfig(**{**fac.STUDENT_PLANNING, "samples": 16, "iterations": 1})
     assert header["planner"].items() <= vars(planning).items()
     assert {*vars(planning)} - {*header["planner"]} == {
-        "horizon", "discount", "returns", "action_repeat"}
-    assert (result["max_std"], result["samples"]) == (width, 16)
+        "horizon", "discount", "speed", "action_repeat"}
+    assert [result[name] for name in fac.CHOSEN] == [0.15, 16, 1]
+    assert result["played"] == header["played"] == [] and "chosen by" not in table
 
 
-@pytest.mark.parametrize("flags, gain, expected", [
-    ([], 1.0, (1.0, 32, 3)), ([], -1.0, (0.15, 32, 3)),
-    (["--plan-max-std", "0.3"], 1.0, (0.3, 32, 3)), (["--plan-samples", "8"], 1.0, (1.0, 8, 3)),
-    (["--plan-min-std", "1.5", "--plan-max-std", "2"], 1.0, (2.0, 32, 3)),
-    (["--preset", "plain"], None, (2.0, 128, 4)),
-    (["--plan-prior", "last"], None, (2.0, 128, 4)),
-    (["--plan-elites", "20"], -1.0, (0.15, 20, 2)),  # of many agents, which search with 16 samples
-    (["--plan-elites", "20", "--plan-samples", "24"], -1.0, (0.15, 24, 2))])
-def test_who_finds_better_plans_far_away_searches_widely(
-        tmp_path, files, monkeypatch, capsys, flags, gain, expected):
-    monkeypatch.setattr(fac, "plan_gains", lambda expert, student, planning, obs: [np.full(
-        obs.shape[1], gain * (planning.max_std >= 1))])
-    monkeypatch.setattr(fac, "evaluate_both", lambda expert, student, *_: (
-        planned.append(vars(student[1])), {})[1])
-    monkeypatch.setattr(fac, "time_both", lambda *_: {})
-    monkeypatch.setattr(fac, "report", lambda *_: None)
-    if "--plan-elites" in flags:
-        monkeypatch.setattr(fac, "MANY_AGENTS", 3)  # as the reacher's
-    planned = []
+@pytest.fixture
+def quick(files, tmp_path, monkeypatch, capsys):
+    """distill in this process and in `out`, with the default search unless flags say otherwise,
+    where priors learn to be `taught`, and `chosen` of the plannings is chosen by playing: result,
+    student, header, plannings that were tried, (model, planning)s that were evaluated."""
     arguments = distill_arguments(files, "--workers", "0", "--json", "--out", tmp_path / "out")
     own = arguments.index("--plan-samples")
-    assert fac.main([*map(str, arguments[:own] + arguments[own + 4:]), *flags]) == 0
-    header, _ = fac.read_npz(tmp_path / "out" / "student.npz", ("student",))
-    result = json.loads(capsys.readouterr().out)
-    for found in (result, header["planner"], *planned):
-        assert tuple(found[name] for name in ("max_std", "samples", "iterations")) == expected
-    assert [vars(fac.PlannerConfig(**fac.made_for(header, "student")))] == planned  # as evaluate
+    arguments = [str(a) for a in arguments[:own] + arguments[own + 4:]]
+    returns = [{"taught": "plans", **dict.fromkeys(fac.CHOSEN, 1), "returns": [2.0]}]
+
+    def distill(*flags, taught=0.5, chosen=-1):
+        tried, evaluated = [], []
+
+        def teach(distiller, *_):
+            for key, value in fac.prior_weights(distiller.student).items():
+                distiller.student.params[key] = value * 0 + taught
+            return {"policy": fac.prior_weights(distiller.student)}
+
+        def choose(distiller, task, taught, plannings, workers):
+            tried.extend(plannings)
+            assert [*taught] == ["policy"]
+            return plannings[chosen], returns
+
+        with monkeypatch.context() as patch:
+            for name, stands in {
+                    "teach_priors": taught and teach, "choose_by_playing": taught and choose,
+                    "play": None, "learn_priors": None, "time_both": lambda *_: {},
+                    "report": lambda *_: None, "draw_curve": lambda *_: True,
+                    "evaluate_both": lambda expert, student, *_: evaluated.append(student) or {},
+            }.items():
+                patch.setattr(fac, name, stands)
+            assert fac.main([*arguments, *flags]) == 0, capsys.readouterr().err
+        student, header = fac.load_model(tmp_path / "out" / "student.npz")
+        return json.loads(capsys.readouterr().out), student, header, tried, evaluated
+
+    return distill
+
+
+@pytest.mark.parametrize("flags, tried", [
+    ([], [(0.15, 32, 0), (0.15, 16, 2), (0.15, 32, 3), (1.0, 32, 3)]),
+    (["--plan-max-std", "0.3"], [(0.3, 32, 0), (0.3, 16, 2), (0.3, 32, 3)]),
+    (["--plan-min-std", "0.1"], [(0.15, 32, 0), (0.15, 16, 2), (0.15, 32, 3), (1.0, 32, 3)]),
+    (["--plan-samples", "8"], [(0.15, 8, 0), (0.15, 8, 2), (0.15, 8, 3), (1.0, 8, 3)]),
+    (["--plan-iterations", "1"], [(0.15, 32, 1), (0.15, 16, 1), (1.0, 32, 1)]),
+    (["--plan-iterations", "3", "--plan-max-std", "1"], [(1.0, 32, 3), (1.0, 16, 3)]),
+    (["--plan-samples", "8", "--plan-iterations", "1", "--plan-max-std", "0.5"], [(0.5, 8, 1)]),
+    (["--plan-elites", "20"], [(0.15, 32, 0), (0.15, 20, 2), (0.15, 32, 3), (1.0, 32, 3)]),
+    (["--plan-elites", "20", "--plan-samples", "24"],
+     [(0.15, 24, 0), (0.15, 24, 2), (0.15, 24, 3), (1.0, 24, 3)])])
+def test_searches_that_flags_leave_are_tried_cheapest_first(quick, flags, tried):
+    """And the one that is chosen is the student's, here, in its file and where it is evaluated."""
+    chosen = len(tried) // 2
+    result, _, header, found, evaluated = quick(*flags, chosen=chosen)
+    assert [tuple(getattr(of, name) for name in fac.CHOSEN) for of in found] == tried
+    rest = [{k: v for k, v in vars(of).items() if k not in fac.CHOSEN} for of in found]
+    assert all(of == rest[0] for of in rest) and rest[0]["prior"] == "own"
+    ((_, planning),) = evaluated
+    assert planning == found[chosen] == fac.PlannerConfig(**fac.made_for(header, "student"))
+    assert [result[name] for name in fac.CHOSEN] == [*tried[chosen]]
+    assert result["played"] == header["played"] and len(result["played"]) == 1
+
+
+@pytest.mark.parametrize("flags, priors", [
+    (["--no-priors"], False), (["--preset", "plain"], False), (["--plan-prior", "last"], True)])
+def test_students_that_do_not_begin_from_priors_plan_from_the_last_plan(quick, flags, priors):
+    """Nothing is chosen by playing; what has no priors learns none."""
+    result, student, header, tried, evaluated = quick(*flags, taught=0.5 if priors else None)
+    assert tried == [] == result["played"] and student.config.prior_steps == 2 * priors
+    ((learner, planning),) = evaluated
+    assert planning == fac.PlannerConfig(horizon=1) and header["planner"]["prior"] == "last"
+    assert planning == fac.PlannerConfig(**fac.made_for(header, "student"))
+    assert bool(fac.prior_weights(student)) == priors == bool(fac.prior_weights(learner))
+
+
+def test_a_finished_run_given_again_reads_its_priors_and_its_choice(quick, tmp_path):
+    """And plays nothing to find them; flags go before the choice."""
+    first = quick(chosen=1)
+    written = (tmp_path / "out" / "student.npz").read_bytes()
+    again = quick(taught=None)  # whatever teaches or chooses is gone
+    assert (tmp_path / "out" / "student.npz").read_bytes() == written
+    ((learner, planning),) = again[4]
+    priors = fac.prior_weights(learner)
+    assert priors and all((value == 0.5).all() for value in priors.values())
+    assert planning == first[4][0][1] and (planning.samples, planning.iterations) == (16, 2)
+    assert again[0]["played"] == first[0]["played"] == first[2]["played"] == again[2]["played"]
+    ((_, planning),) = quick("--plan-max-std", "0.5", taught=None)[4]
+    assert [getattr(planning, name) for name in fac.CHOSEN] == [0.5, 16, 2]
+    ((_, planning),) = quick("--plan-prior", "last", taught=None)[4]
+    assert planning == fac.PlannerConfig(horizon=1)
+
+
+def test_evaluate_plans_a_student_as_it_was_chosen(quick, tmp_path, monkeypatch):
+    """With --prior last by the planner's own defaults: its search was around priors."""
+    seen = []
+    _, _, _, tried, _ = quick(chosen=1)
     monkeypatch.setattr(fac, "evaluate", lambda model, task, planning, *_: (
-        planned.append(planning), {"returns": [0.0], "plan_ms_median": 0.0})[1])
-    fac.main(["evaluate", "--model", str(tmp_path / "out" / "student.npz"), "--prior", "last"])
-    sizes = planned[-1].max_std, planned[-1].samples, planned[-1].iterations, planned[-1].output
-    assert sizes == ((*expected, "sampled") if gain is None else (2.0, 128, 4, "sampled"))
-    wider = gain and float(gain * (expected[0] < 2))  # than what the flags say
-    assert result["wide_search_gain"] == (gain and [wider, 0.0])
-
-
-@pytest.mark.parametrize("agents, width, gain, noise, expected", [
-    (11, 0.15, -1.0, 0.0, {}), (12, 0.15, -1.0, 0.0, {"samples": 16, "iterations": 2}),
-    (12, 0.15, 1.0, 0.0, {"max_std": 1.0}), (3, 0.15, 1.0, 0.0, {"max_std": 1.0}),
-    (3, 0.15, 0.17, 1.0, {}), (3, 0.15, 0.2, 1.0, {"max_std": 1.0}),  # 2.7, 3.2 standard errors
-    (12, 2.0, 0.0, 0.0, {})])  # one that a flag made wide
-def test_a_search_is_wide_where_its_gain_is_sure_and_small_where_many_agents_do_not(
-        files, monkeypatch, agents, width, gain, noise, expected):
-    values = noise * np.tile([-1.0, 1.0], 128)
-    monkeypatch.setattr(fac, "plan_gains", lambda expert, student, planning, obs: [
-        gain + values if planning.max_std == 1 else 0 * values])
-    distiller = SimpleNamespace(
-        seed=0, expert=None, held_out_starts=np.arange(9), replay=fac.Replay(files / "replay.npz"),
-        student=SimpleNamespace(config=SimpleNamespace(num_agents=agents)))
-    search, (mean, error) = fac.student_search(distiller, fac.PlannerConfig(max_std=width))
-    assert search == expected
-    np.testing.assert_allclose((mean, error), (gain, noise / 16), rtol=0.01)
+        seen.append(planning), {"returns": [0.0], "plan_ms_median": 0.0})[1])
+    for flags in ([], ["--samples", "7"], ["--prior", "last"]):
+        fac.main(["evaluate", "--model", str(tmp_path / "out" / "student.npz"), *flags])
+    assert seen == [tried[1], dataclasses.replace(tried[1], samples=7),
+                    fac.PlannerConfig(horizon=1)]
 
 
 def test_part_one_alone_distils_and_goes_on_from_its_end(tmp_path, files):
@@ -484,7 +535,7 @@ def test_part_one_alone_distils_and_goes_on_from_its_end(tmp_path, files):
     assert first["student_returns"] == second["student_returns"] and first["kl_value"] > 0
     header, _ = fac.read_npz(tmp_path / "runs/reacher-hard-0/student.npz", ("student",))
     assert header["distill"]["targets"] == "joint" and header["distill"]["reuse"] == 1
-    assert header["planner"]["prior"] == "none"
+    assert header["planner"]["prior"] == "last"
     refused(run(*arguments, "--targets", "credit", cwd=tmp_path), "--plain", "without --targets")
 
 
@@ -661,7 +712,8 @@ def test_numpy_may_be_set_to_raise(tmp_path, files):
         distiller = fac.Distiller(expert, fac.Replay(files / "replay.npz"), config)
         for _ in distiller.run():
             pass
-        fac.rank_results(distiller, 8, 0.99)
+        distiller.ranks(8, 0.99)
+        fac.teach_priors(distiller, None, fac.PlannerConfig(samples=8))
         distiller.close()
         assert fac.compact(np.array([[1e9], [1.0]])).dtype == np.float32
         with pytest.raises(FloatingPointError):  # the caller's setting stays
@@ -714,6 +766,10 @@ def test_distill_writes_its_results_and_nothing_else(distilled):
     model, header = fac.load_model(folder / "student.npz")
     assert model.config.num_agents == 3 and (header["kind"], header["task"]) == (
         "student", "reacher-hard")
+    with np.load(folder / "student.npz") as file:  # nothing of its expert's but the encoder
+        assert {key.split(".")[0] for key in file.files} == {
+            "header", "_encoder", "_dynamics", "_reward", "_Q1", "_Q2", "_expert_encoder",
+            "_prior_encoder", "_prior"}
     config = json.loads((folder / "config.json").read_text())
     assert config["distill"]["steps"] == STEPS and config["planner"]["samples"] == 16
     assert config["num_agents"] == 3 and config["seed"] == 0
@@ -742,7 +798,7 @@ def test_the_student_differs_from_its_start(distilled, files):
         changed = {k for k, v in distiller.student.params.items() if v.tobytes() != weights[k]}
     finally:
         distiller.close()
-    for network in ("_encoder", "_dynamics", "_reward", "_Q1", "_Q2"):
+    for network in ("_encoder", "_dynamics", "_reward", "_Q1", "_Q2", "_prior_encoder", "_prior"):
         assert f"{network}.0.weight" in changed
     assert not [k for k in changed if k.startswith("_expert")]
 
@@ -822,7 +878,9 @@ def test_a_killed_run_whose_expert_plays_goes_on(tmp_path, files, no_plots):
                                       *more)
         return launch(["-c", DRIVER, stop, *arguments], tmp_path, no_plots)
 
-    succeeded(distill("whole", "--workers", "1"))
+    told = succeeded(distill("whole", "--workers", "1")).stdout
+    assert "chosen by playing 1 episodes of the run's own seeds" in told
+    assert "the expert's policy" in told and "the student's plans" in told
     for stop in (3, 5):
         assert distill("parts", "--workers", "2", stop=stop).returncode == -signal.SIGKILL
     with np.load(tmp_path / "parts" / "checkpoint.npz") as file:
@@ -972,10 +1030,14 @@ def test_distill_compares_with_the_expert_s_policy_and_with_it_in_the_student_s_
     expert = random_model(1, policy=True), own
     around = fac.PlannerConfig(**fac.STUDENT_PLANNING, elites=5, horizon=1)
     found = fac.compared(expert, (None, around))
-    assert [*found] == ["expert", "student", "policy", "same_search"]
+    assert [*found] == ["expert", "student", "policy", "reflex", "same_search"]
     model, same = found["same_search"]
     assert model is expert[0]  # its own horizon and discount; a student has no proposals
     assert same == fac.dataclasses.replace(around, horizon=2, discount=0.5, pi_trajs=0)
+    alone = fac.dataclasses.replace(around, iterations=0)
+    assert found["reflex"] == (None, alone)
+    assert found["policy"] == (expert[0], fac.dataclasses.replace(own, prior="own", iterations=0))
+    assert [*fac.compared(expert, (None, alone))] == ["expert", "student", "policy"]
     assert [*fac.compared(expert, (None, own))] == ["expert", "student", "policy"]
     assert [*fac.compared((random_model(1), own), (None, own))] == ["expert", "student"]
 
@@ -1044,7 +1106,7 @@ def test_models_plan_with_the_discount_they_were_trained_with(tmp_path, files, c
             return
         for command in (arguments, *evaluations, [*evaluations[0], "--discount", "0.5"]):
             assert fac.main([str(a) for a in command]) == 0
-    assert seen == [0.9] * 6 + [0.5] and evaluate is fac.evaluate  # four in distill
+    assert seen == [0.9] * 7 + [0.5] and evaluate is fac.evaluate  # five in distill
 
 
 def test_recorded_returns_stand_for_the_expert_in_distill(tmp_path, files, no_plots, monkeypatch,
@@ -1089,7 +1151,7 @@ def test_recorded_returns_stand_for_the_expert_in_distill(tmp_path, files, no_pl
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert result["expert_recorded"] is False and result["expert_returns"] == [123.0]
     assert labels == ["evaluating the expert", "evaluating the student",
-                      "evaluating its policy alone",
+                      "evaluating its policy alone", "evaluating its priors alone",
                       "evaluating expert, searching like its student"]
 
 
@@ -1109,7 +1171,7 @@ def test_expert_and_student_plan_over_the_horizon_they_were_made_for(tmp_path, f
     assert timed[:2] == [3, 2]
     evaluation = ["evaluate", "--model", str(tmp_path / "student.npz")]
     assert fac.main(evaluation) == fac.main([*evaluation, "--horizon", "0"]) == 0
-    assert seen == [3, 2, 3, 3, 2, 0]  # expert, student, expert in two more ways; evaluate twice
+    assert seen == [3, 2, 3, 2, 3, 2, 0]  # expert, student, each in more ways; evaluate twice
 
 
 def test_a_terminal_without_plus_minus_gets_its_table(tmp_path, files):

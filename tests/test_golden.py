@@ -150,7 +150,7 @@ def narrow_case(tag, dtype):
     header, arrays = fac.read_npz(NARROW, ("golden",))
     g = {k[len(tag) + 1:]: v for k, v in arrays.items() if k.startswith(tag + " ")}
     config = header["configs"][tag]
-    student = fac.WorldModel(fac.ModelConfig(**config["student"]), {
+    student = fac.WorldModel(fac.ModelConfig(**present(fac.ModelConfig, config["student"])), {
         k[len("weight "):]: v.astype(dtype) for k, v in g.items() if k.startswith("weight ")})
     batch = [g[k].astype(dtype) for k in ("features", "actions", "targets")]
     return student, batch, g, fac.DistillConfig(**present(fac.DistillConfig, config["distill"]))

@@ -352,7 +352,7 @@ def test_a_prior_names_its_steps_and_then_its_last_one_again():
 
 
 @pytest.mark.parametrize("output", ["sampled", "mean"])
-def test_a_search_around_the_prior_starts_there_every_time(output):
+def test_a_search_around_the_prior_starts_there_every_time(monkeypatch, output):
     """In each agent's own plan, an expert's policy rolled out, with the first deviation for
     width."""
     expert, obs = random_model(1, policy=True), np.full(8, 0.3, np.float32)
@@ -360,17 +360,17 @@ def test_a_search_around_the_prior_starts_there_every_time(output):
     config = fac.PlannerConfig(prior="own", samples=400, iterations=1, min_std=0.01,
                                max_std=0.01, horizon=2, output=output, pi_trajs=0)
     rollout = fac.policy_rollout(expert, expert.encode(obs[:, None]), [np.float32(0)] * 3)
+    seen, returns = [], fac.Returns.__call__
+    monkeypatch.setattr(fac.Returns, "__call__", lambda self, actions: (
+        seen.append(actions), returns(self, actions))[1])
     for model, expected in ((student, written_out(student, obs)[:, :3]),
                             (expert, rollout[:, 0, :, 0][None])):
-        planner, seen = fac.Planner(model, config), []
-        start = planner.own.fast.start
-        planner.own.fast.start = lambda *args: (
-            lambda G: lambda actions: seen.append(actions) or G(actions))(start(*args))
+        planner = fac.Planner(model, config)
         for _ in range(2):
             planner.act(obs)
-        assert len(seen) == 2 and np.abs(expected).max() > 0.1
-        for actions in seen:  # (N, L, d, S)
-            assert np.abs(actions.mean(-1) - np.clip(expected, -1, 1)).max() < 0.01
+        assert np.abs(expected).max() > 0.1
+        for actions in (seen.pop(0), seen.pop(0)):  # (N, L, d, S)
+            assert np.abs(actions.mean(-1) - expected).max() < 0.01
             assert actions.std(-1).max() < 0.015
 
 

@@ -194,7 +194,7 @@ def test_priors_learn_from_the_states_that_they_get_into_themselves(replay, monk
     assert [(number, len(data)) for number, data in rounds] == [(0, 1), (1, 2), (2, 3), (3, 1)]
     seeds = fac.training_seeds(0, "prior episode", 0, 6)  # two a round: a quarter of five
     assert [own for _, own, _, _ in played] == [seeds[2:4], seeds[4:], seeds[:2]]
-    for reflex, _, (noise, teacher), _ in played:
+    for reflex, _, (noise, _), _ in played:
         assert (reflex.prior, reflex.iterations, noise) == ("own", 0, fac.OWN_NOISE)
     assert [teacher for *_, (_, teacher), _ in played] == [None, None, planning]
     whole = len(distiller.train_starts) + len(distiller.played)
