@@ -2694,10 +2694,10 @@ def run_command(parser, argv=None):
         sys.stdout.reconfigure(errors="replace")
     try:
         with contextlib.ExitStack() as stack:
-            if args.json and argv is None:  # the last line, whatever a robot prints in C, or ending
+            if args.json and argv is None and sys.stdout is sys.__stdout__:
                 own = os.fdopen(os.dup(1), "w", encoding=sys.stdout.encoding, errors="replace")
                 stack.enter_context(contextlib.redirect_stdout(stack.enter_context(own)))
-                os.dup2(2, 1)
+                os.dup2(2, 1)  # for what a robot prints in C, or ending: JSON is the last line
             result = args.run(args)
             print(f"\n{json.dumps(result)}\n" if args.json else "", end="", flush=True)
     except (UserError, MemoryError, OSError, RuntimeError) as error:

@@ -681,6 +681,11 @@ def test_milliseconds_are_medians_over_rounds(monkeypatch):
     (row,) = experiments.time_runs([experiments.make_run("x", 0, "expert", samples=7)],
                                    lambda run: (random_model(1), {}), 3)
     assert row["ms"] == row["ms_workers"] == 2
+    monkeypatch.setattr(fac, "cores", lambda: 2)  # of which no second process can be had
+    monkeypatch.setattr("multiprocessing.util.spawnv_passfds", lambda *_: os.close(-1))
+    (row,) = experiments.time_runs([experiments.make_run("x", 0, "student", samples=7)],
+                                   lambda run: (random_model(), {}), 3)
+    assert row["ms"] == row["ms_workers"] == 2
 
 
 def test_figures_7_and_8_plan_with_both_models(tmp_path, monkeypatch, capsys):
