@@ -1176,10 +1176,9 @@ class PlainDistiller(Distiller):
 
     def __init__(self, expert, replay, config, num_agents=None, seed=0):
         need((config.targets, config.policy_share, config.expert_episodes, config.reuse,
-              config.priors) == ("joint", 0, 0, 1, False), "--plain is Algorithm 1 alone: without "
-             "--targets, --policy-share, --expert-episodes, --reuse and --priors")
-        need(not isinstance(num_agents, str), "--plain cuts actions in their order; pass "
-             "--num-agents for --agents")
+              config.priors, isinstance(num_agents, str)) == ("joint", 0, 0, 1, False, False),
+             "--plain is Algorithm 1 alone: without --targets, --policy-share, "
+             "--expert-episodes, --reuse and --priors, and with --num-agents for --agents")
         super().__init__(expert, replay, config, num_agents, seed)
         self._plain = distill(expert, replay, config, self.student.config.num_agents, seed)
 
@@ -1273,8 +1272,9 @@ class Returns:
         return self
 
     def __call__(self, actions):
-        """actions (N, L, d, S) -> G (N, S)."""
-        blocks = np.array_split(actions, sample_blocks(self.sizes, actions.shape[-1]), axis=-1)
+        """actions (N, L, d, S) -> G (N, S), in blocks of samples that fit the cache."""
+        size = 256 if self.sizes.mlp_dim >= 256 else 128  # OpenBLAS is fastest so
+        blocks = np.array_split(actions, max(1, round(actions.shape[-1] / size)), axis=-1)
         return np.concatenate([self._block(block) for block in blocks], 1)
 
     def _block(self, actions):
@@ -1307,9 +1307,6 @@ class Returns:
         return np.tanh(y, out=y).reshape(shape)
 
 
-def sample_blocks(sizes, samples):
-    """Blocks of samples: OpenBLAS is fastest on small matrices when a block fits the cache."""
-    return max(1, round(samples / (256 if sizes.mlp_dim >= 256 else 128)))
 
 
 class FastPlanner(AgentPlanner):
@@ -1328,8 +1325,7 @@ class FastPlanner(AgentPlanner):
     def plan(self, latents):
         actions = super().plan(latents)
         need(np.isfinite(actions).all() and np.isfinite(self.mean).all(), "planning: no action "
-             "sequence has a finite return; the model's weights or the observation are far out of "
-             "range")
+             "sequence has a finite return; weights or observation are far out of range")
         return actions
 
 
@@ -1667,13 +1663,6 @@ def robot_step(robot, action, sizes, t):
     return obs, number, any(ends), any(ends[:1])
 
 
-def robot_steps(robot, config):
-    """T of a robot: its `episode_steps`, if it has some, or a PlannerConfig's."""
-    found = getattr(robot, "episode_steps", None)
-    T = episode_steps(config.action_repeat) if found is None else found
-    need(isinstance(T, (int, np.integer)) and T > 0, "the robot's episode_steps: expected a whole "
-         f"number above 0, found {T!r}")
-    return int(T)
 
 
 def lookup_task(task):
@@ -1955,13 +1944,16 @@ def episodes_of(model, task, config, seeds, environment, noise, teacher):
             yield from episodes_of(model, task, config, seeds, robot, noise, teacher)
         return
     planners, sizes = [Planner(model, of) for of in (config, teacher) if of], model.config
+    T = getattr(environment, "episode_steps", episode_steps(config.action_repeat))
+    need(isinstance(T, (int, np.integer)) and T > 0, "the robot's episode_steps: expected a whole "
+         f"number above 0, found {T!r}")
     for seed in seeds:
         for planner in planners:
             planner.reset(seed)
         obs = checked(ask(environment.reset, seed, "reset"), (sizes.dim_obs,), "reset: observation")
         rng, decisions = stream(seed, "exploration"), []
         deviation = F32(rng.uniform(0, noise))
-        for t in range(robot_steps(environment, config)):
+        for t in range(T):
             begin = time.perf_counter()
             action = planners[0].act(obs)
             seconds = time.perf_counter() - begin
@@ -2504,19 +2496,17 @@ def report(result, plannings):
     """Print distill's table. plannings: the expert's and the student's."""
     source = "measured now" if not result["expert_recorded"] else "recorded" if (
         result["expert_versions"] == software()) else "recorded with other versions"
-    horizons = [result[f"{kind}_horizon"] for kind in ("expert", "student")]
-    over = [f", H = {h}" if horizons[0] != horizons[1] else "" for h in horizons]
-    budgets = [f"{config.samples} x {config.iterations}" if config.iterations else "0"
-               for config in plannings]
-    print(f"\n{result['task']}, {result['episodes']} episodes, evaluation seed "
-          f"{result['eval_seed']}, horizon {' and '.join(map(str, dict.fromkeys(horizons)))}\n")
+    own, search = (f"{of.samples} x {of.iterations}" if of.iterations else "0" for of in plannings)
+    print("\n{task}, {episodes} episodes, evaluation seed {eval_seed}, horizon {expert_horizon} "
+          "and {student_horizon}\n".format_map(result))
+    expert, student = f"expert ({source}), one process", f"student, N = {result['num_agents']}"
     rows = [("", "MPPI", "return", "ms a decision", "speed-up")]
     for name, budget, who, timed in (
-            (f"expert ({source}), one process{over[0]}", budgets[0], "expert", "expert"),
+            (f"{expert}, H = {result['expert_horizon']}", own, "expert", "expert"),
             (COMPARED["policy"], "0", "policy", "policy"),
-            (COMPARED["same_search"], budgets[1], "same_search", "same_search"),
-            (f"student, N = {result['num_agents']}, its priors alone", "0", "reflex", "reflex"),
-            (f"student, N = {result['num_agents']}, one process{over[1]}", budgets[1], "student",
+            (COMPARED["same_search"], search, "same_search", "same_search"),
+            (f"{student}, its priors alone", "0", "reflex", "reflex"),
+            (f"{student}, one process, H = {result['student_horizon']}", search, "student",
              "student_in_process"),
             (f"student, workers beside: {result['plan_workers']}", "", "",
              "student" if result["plan_workers"] else "nowhere")):
@@ -2525,7 +2515,8 @@ def report(result, plannings):
                          f"{result[f'{who}_return_std']:.0f}" if who else "the same plans",
                          f"{ms:.1f}", f"{result['plan_ms_expert'] / ms:.1f}"))
     print_table(rows)
-    report_played(result)
+    if result["played"]:
+        report_played(result)
     q, g = (result[f"rank_correlation_{key}"] for key in ("by_step", "returns"))
     kept = "-" if result["kept"] is None else f"{result['kept']:.2f}"
     print(f"\nreturn kept {kept}, rank correlation of Q {q[0]:.3f} (h = 0) to {q[-1]:.3f} (h = "
@@ -2535,17 +2526,16 @@ def report(result, plannings):
 
 def report_played(result):
     """Print what `choose_by_playing` saw: returns, and by what each is below the best one."""
-    if not (played := result["played"]):
-        return
+    played = result["played"]
     best = np.array(max((of["returns"] for of in played), key=np.mean))
     print(f"\nchosen by playing {len(best)} episodes of the run's own seeds (below the best ± "
           "standard error): {samples} x {iterations}, deviation {max_std}\n".format_map(result))
     rows = [("priors taught", "MPPI", "first deviation", "return", "below the best")]
     for of in played:
-        behind, search = best - np.array(of["returns"]), of["iterations"]
-        rows.append((f"the expert's {of['taught']}" if of["taught"] == "policy" else
-                     "the student's plans", f"{of['samples']} x {search}" if search else "0",
-                     f"{of['max_std']}" if search else "-", f"{np.mean(of['returns']):.0f}",
+        behind = best - np.array(of["returns"])
+        search = (f"{of['samples']} x {of['iterations']}", f"{of['max_std']}")
+        rows.append((of["taught"], *(search if of["iterations"] else ("0", "-")),
+                     f"{np.mean(of['returns']):.0f}",
                      f"{behind.mean():.0f} ± {behind.std() / max(1, len(best) - 1) ** 0.5:.0f}"))
     print_table(rows)
 
