@@ -2003,7 +2003,8 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
     found = [np.full((E, T, n), np.nan, F32) for n in (sizes.dim_obs, sizes.dim_action)]
     found += [np.zeros((E, T)), np.full((E, T), np.nan)]
     if teacher:
-        found.append(np.full((E, T, sizes.dim_action * (teacher.horizon + 1)), np.nan, F32))
+        steps = teacher.horizon + 1 if teacher.iterations else 1
+        found.append(np.full((E, T, sizes.dim_action * steps), np.nan, F32))
     for i, decisions in enumerate(episodes):
         for array, values in zip(found, zip(*decisions)):
             array[i, :len(decisions)] = values
@@ -2091,7 +2092,7 @@ def teach_priors(distiller, task, planning, workers=None, environment=None):
             data.append(policy_at(own_states(number)[0]))
         learn_priors(distiller, data, number)
     taught = {"policy": prior_weights(student)}
-    if episodes:
+    if episodes and planning.iterations:
         obs, plans = own_states(0, planning)
         plans = plans.reshape(student.config.num_agents, L, -1, obs.shape[1])
         learn_priors(distiller, [(in_parts(student.read, obs), plans)], PRIOR_ROUNDS)
@@ -2417,7 +2418,7 @@ def distil_and_save(distiller, args, planning, header, out):
             planning = planned(**{name: own[name] for name in CHOSEN if name in own})
     elif config.priors:
         taught = teach_priors(distiller, args.task, planning, args.workers)
-        if planning.prior == "own":
+        if planning.prior == "own" and config.expert_episodes:
             planning, played = choose_by_playing(
                 distiller, args.task, taught, [*dict.fromkeys(
                     planned(**search) for search in SEARCHES)], args.workers)
