@@ -409,10 +409,10 @@ def test_a_run_is_distilled_as_it_says(monkeypatch):
 
 
 @pytest.mark.parametrize("case, settings, prior", [
-    ("default", {}, "policy"), ("D3", {"encoder_input": "observation"}, "none"),
-    ("D8", {"policy_share": 0.0}, "policy"), ("D9", {"targets": "joint"}, "none")])
-def test_a_departure_s_student_searches_around_the_policy_but_for_d3_and_d9(monkeypatch, case,
-                                                                           settings, prior):
+    ("default", {}, "own"), ("D3", {"encoder_input": "observation"}, "own"),
+    ("D8", {"policy_share": 0.0}, "own"), ("D9", {"targets": "joint", "priors": False}, "last")])
+def test_a_departure_s_student_searches_around_its_priors_but_for_d9(monkeypatch, case, settings,
+                                                                    prior):
     planned = []
     monkeypatch.setattr(experiments, "measure", lambda model, task, planning, *_: (
         planned.append(planning.prior), fac.Planner(model, planning).close(), {})[2])
@@ -1078,12 +1078,7 @@ def test_the_table_of_students_has_a_line_for_each_preset_and_each_chosen_budget
         heads, _, *lines = ([part.strip() for part in line.split("|")[1:-1]]
                             for line in table.splitlines())
         tables.append([dict(zip(heads, line)) for line in lines])
-    (short,), others, (own, paper, chosen), (search,) = tables
-    assert not others  # that aren't the paper's
-    alike = students.KEPT, students.WINS, students.FASTER
-    assert short == {**{head: own[head] for head in alike}, "task": "walker-run", "N": "6",
-                     "expert": "125", "its policy alone": "100", "student": "100",
-                     "`--preset plain` keeps": "-"}
+    (own, paper, chosen), (search,) = tables
     # over both evaluation seeds: 100, 75, 125, 100; students of each episode less 210 and 20: of
     # both students -50, -5, 15, -20, a standard error of 13.7; of each -2.5, -27.5, one of 12.5
     assert [*search.values()] == ["walker-run", "125", "100", "115", "100", "-15 ± 19", "9.0",
@@ -1122,22 +1117,44 @@ def test_another_budget_of_one_seed_leaves_the_default_s_line_whole(tmp_path):
     assert result["walker-run"]["seeds"] == 2
 
 
-def test_the_readmes_hold_the_tables_that_the_rows_give():
+def test_the_report_holds_the_tables_that_the_rows_give():
     results = ROOT / "data" / "results"
     _, text = experiments.report_students("students", results / "students.csv", None)
-    short, *_, search = text.split("\n\n")
-    assert short in (ROOT / "README.md").read_text(encoding="utf-8")
-    assert search in (results / "README.md").read_text(encoding="utf-8")
+    report = (results / "report.md").read_text(encoding="utf-8")
+    assert [table in report for table in text.split("\n\n")] == [True, True]
+
+
+def test_what_each_joint_wins_alone_is_told_in_two_tables(tmp_path):
+    """A student that doesn't search is its priors, and the same search is the policy."""
+    def rows(iterations, **more):
+        return [{"step": 9, "return_mean": 150.0, "returns": [160.0, 140.0], "minutes": 6.0,
+                 "expert_returns": [200.0, 120.0], "policy_returns": [90.0, 110.0],
+                 "evaluation_seed": seed, "ranks": {
+                     "max_std": 0.15, "samples": 32, "iterations": iterations, **more,
+                     "plan_ms_expert": 9.0, "plan_ms_student_in_process": 2.0}}
+                for seed in (101, 102)]
+
+    write_rows(tmp_path / "alone.csv", [
+        ("walker-run", 0, "default", {"num_agents": 6}, rows(0)),
+        ("cheetah-run", 0, "default", {"num_agents": 6}, rows(
+            3, reflex_returns=[80.0, 60.0], same_search_returns=[210.0, 20.0]))])
+    _, text = experiments.report_alone("alone", tmp_path / "alone.csv", None)
+    short, whole = ([[cell.strip() for cell in line.split("|")[1:-1]] for line in
+                     table.splitlines()[2:]] for table in text.split("\n\n"))
+    # less the expert's: -40, 20, twice, a standard error of 17.3
+    assert short == [["walker-run, N = 6", "160", "100", "150 ± 17", "none", "4"],
+                     ["cheetah-run, N = 6", "160", "100", "150 ± 17", "32 x 3, 0.15", "4"]]
+    assert whole == [["walker-run", "6", "2", "160", "100", "150", "150", "100", "0.94 ± 0.11",
+                      "none", "9.0", "2.0"],
+                     ["cheetah-run", "6", "2", "160", "100", "70", "150", "115", "0.94 ± 0.11",
+                      "32 x 3, 0.15", "9.0", "2.0"]]
 
 
 def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkeypatch):
     steps, step, rows = [], fac.Distiller.step, []
     short_expert_episodes(monkeypatch)
     monkeypatch.setattr(fac.Distiller, "step", lambda self: (steps.append(1), step(self))[1])
-    monkeypatch.setattr(fac, "rank_results", lambda *_: {
-        "rank_correlation": 0.5, "rank_correlation_episodes": 1, **{
-            f"rank_correlation_{key}": [0.25] * 4
-            for key in ("by_step", "returns", "returns_training", "returns_se")}})
+    monkeypatch.setattr(fac.Distiller, "ranks", lambda *_: (np.full(4, 0.5), np.full(4, 0.25)))
     monkeypatch.setattr(fac, "time_both", lambda *_: {
         "plan_workers": 0, **{f"plan_ms_{who}": 1.0 for who in (
             "expert", "policy", "same_search", "student_in_process", "student")}})
@@ -1150,7 +1167,7 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
             "1", *budget, "--students", str(tmp_path)]) == 0
     experiments.append_rows(path := tmp_path / "students.csv", rows)
     rows = experiments.read_rows(path)
-    assert [row["evaluation_seed"] for row in rows] == ["1", "0"] * 2 and len(steps) == 1
+    assert [row["evaluation_seed"] for row in rows] == ["102", "101"] * 2 and len(steps) == 1
     assert [json.loads(row["settings"]).get("samples") for row in rows] == [None, None, 4, 4]
     assert len(experiments.finished(rows)) == 2
     _, header = fac.load_model(tmp_path / "reacher-easy-3" / "student.npz")
@@ -1175,7 +1192,7 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
         assert row["versions"] == experiments.versions()
         assert f"numpy {np.__version__}" in row["versions"] and "mujoco 3" in row["versions"]
     result = json.loads((tmp_path / "reacher-easy-3" / "result.json").read_text())
-    assert (result["eval_seed"], result["samples"]) == (0, 32)
+    assert (result["eval_seed"], result["samples"]) == (101, 32)
     experiments.report_students("students", path, tmp_path)
 
 
@@ -1194,9 +1211,9 @@ def test_milliseconds_of_students_are_measured_anew_for_each_preset_and_budget(t
 
     monkeypatch.setattr(fac, "time_both", time_both)
     experiments.time_students(path, ["walker-run"])
-    assert timed == [[(1, 128, 4, "none"), (6, 32, 3, "policy")],
-                     [(1, 512, 6, "none"), (6, 512, 6, "none")],
-                     [(1, 128, 4, "none"), (6, 512, 6, "policy")]]
+    assert timed == [[(1, 128, 4, "last"), (6, 32, 3, "own")],
+                     [(1, 512, 6, "last"), (6, 512, 6, "last")],
+                     [(1, 128, 4, "last"), (6, 512, 6, "own")]]
     for old, new in zip(before, experiments.read_rows(path), strict=True):
         number = {"paper": 2.0}.get(old["case"], 3.0 if '"samples"' in old["settings"] else 1.0)
         found = {"plan_ms_expert": 30.0, "plan_ms_student": number,
@@ -1220,7 +1237,7 @@ def test_a_preset_s_students_have_its_budget_and_a_folder_of_their_own(monkeypat
         assert experiments.main(["students", "--tasks", "walker-run", "--seeds", "0", *flags]) == 0
     found = [(run["case"], *(json.loads(run["settings"]).get(k) for k in (
         "steps", "samples", "iterations"))) for run in seen]
-    assert found == [("default", 14000, None, None), ("paper", 100000, None, None),
+    assert found == [("default", 7000, None, None), ("paper", 100000, None, None),
                      ("paper", 14000, 128, 4)]
     assert [str(students.folder("runs", "walker-run", 0, preset)) for preset in (
         "default", "paper")] == ["runs/walker-run-0", "runs/walker-run-0-paper"]
@@ -1384,8 +1401,7 @@ def test_figure9_and_agreement_draw_a_model(tmp_path):
     student = random_model()
     fac.save_model(tmp_path / "student.npz", student, {"kind": "student", "task": "reacher-hard"})
     before = look.untrained(student, 3)  # as distillation begins
-    _, fresh = fac.new_student(student.expert, student.config, 3) if student.expert else (
-        0, fac.WorldModel.create(student.config, fac.stream(3, "student")))
+    fresh = fac.WorldModel.create(student.config, fac.stream(3, "student"))
     for key, value in before.params.items():
         own = fresh if key.startswith("_encoder.") else student
         assert np.array_equal(value, own.params[key]), key
