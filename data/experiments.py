@@ -794,7 +794,7 @@ def report_figure8(_, path, figures):
 def report_students(_, path, figures):
     """Students as `distill` makes them: the README's main table, all of it, the same search."""
     lines = students.by_line(
-        row for own in settled(path, VARIED["students"], False).values() for row in own)
+        [row for own in settled(path, VARIED["students"], False).values() for row in own])
     result, text = students.table(lines, {
         task: f"{found[1]} / {found[0]}" for task, found in AUTHORS.items()})
     return result, "\n".join([text, students.search_table(lines)])

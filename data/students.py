@@ -118,12 +118,11 @@ def line_of(row):
 
 
 def by_line(rows):
-    """{line: {evaluation seed: rows by seed}}."""
+    """{line: {evaluation seed, lowest first: rows by seed}}."""
     found = {}
-    for row in rows:
-        found.setdefault(line_of(row), {}).setdefault(
-            int(row["evaluation_seed"]), []).append(row)
-    return found
+    for row in sorted(rows, key=lambda row: int(row["evaluation_seed"])):
+        found.setdefault(line_of(row), {}).setdefault(int(row["evaluation_seed"]), []).append(row)
+    return {line: found[line] for line in dict.fromkeys(map(line_of, rows))}
 
 
 def table(lines, authors):

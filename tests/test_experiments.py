@@ -1155,6 +1155,11 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
     short_expert_episodes(monkeypatch)
     monkeypatch.setattr(fac.Distiller, "step", lambda self: (steps.append(1), step(self))[1])
     monkeypatch.setattr(fac.Distiller, "ranks", lambda *_: (np.full(4, 0.5), np.full(4, 0.25)))
+    monkeypatch.setattr(students, "EVALUATION_SEEDS", (0, 1))  # whose expert is on record
+    monkeypatch.setattr(fac, "teach_priors", lambda distiller, *_: {
+        "policy": fac.prior_weights(distiller.student)})
+    monkeypatch.setattr(fac, "choose_by_playing", lambda distiller, task, taught, plannings, *_: (
+        plannings[-2], []))  # narrow
     monkeypatch.setattr(fac, "time_both", lambda *_: {
         "plan_workers": 0, **{f"plan_ms_{who}": 1.0 for who in (
             "expert", "policy", "same_search", "student_in_process", "student")}})
@@ -1167,7 +1172,7 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
             "1", *budget, "--students", str(tmp_path)]) == 0
     experiments.append_rows(path := tmp_path / "students.csv", rows)
     rows = experiments.read_rows(path)
-    assert [row["evaluation_seed"] for row in rows] == ["102", "101"] * 2 and len(steps) == 1
+    assert [row["evaluation_seed"] for row in rows] == ["1", "0"] * 2 and len(steps) == 1
     assert [json.loads(row["settings"]).get("samples") for row in rows] == [None, None, 4, 4]
     assert len(experiments.finished(rows)) == 2
     _, header = fac.load_model(tmp_path / "reacher-easy-3" / "student.npz")
@@ -1192,7 +1197,7 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
         assert row["versions"] == experiments.versions()
         assert f"numpy {np.__version__}" in row["versions"] and "mujoco 3" in row["versions"]
     result = json.loads((tmp_path / "reacher-easy-3" / "result.json").read_text())
-    assert (result["eval_seed"], result["samples"]) == (101, 32)
+    assert (result["eval_seed"], result["samples"]) == (0, 32)
     experiments.report_students("students", path, tmp_path)
 
 
