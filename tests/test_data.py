@@ -22,11 +22,11 @@ from numpy_learner import ExpertConfig  # noqa: E402
 F32 = np.float32
 
 
-def make_model(num_agents=1, policy=False, expert_latent_dim=0):
+def make_model(num_agents=1, policy=False, expert_latent_dim=0, prior_steps=0):
     """A small model of 6 actions with no weight left at its initial zero or one."""
     config = fac.ModelConfig(dim_obs=7, dim_action=6, num_agents=num_agents, latent_dim=5,
                              enc_dim=9, mlp_dim=11, expert_latent_dim=expert_latent_dim,
-                             expert_enc_dim=8)
+                             expert_enc_dim=8, prior_steps=prior_steps)
     rng = np.random.default_rng(0)
     model = fac.WorldModel.create(config, rng, policy)
     for value in model.params.values():
@@ -86,10 +86,12 @@ def write_replay(path, **changes):
 # models: round trip -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("num_agents, policy, expert_latent_dim", [
-    (1, True, 0), *((n, False, width) for n in (1, 2, 3) for width in (0, 13))])
-def test_a_model_comes_back_bit_for_bit(tmp_path, num_agents, policy, expert_latent_dim):
-    model = make_model(num_agents, policy, expert_latent_dim)
+@pytest.mark.parametrize("num_agents, policy, expert_latent_dim, prior_steps", [
+    (1, True, 0, 0), *((n, False, width, L) for n in (1, 2, 3) for width in (0, 13) for L in (0, 4))
+])
+def test_a_model_comes_back_bit_for_bit(tmp_path, num_agents, policy, expert_latent_dim,
+                                        prior_steps):
+    model = make_model(num_agents, policy, expert_latent_dim, prior_steps)
     path = tmp_path / "model.npz"
     fac.save_model(path, model, {"kind": "student", "task": "fish-swim", "extra": [1, {"a": 2.5}]})
     found, header = fac.load_model(path)
@@ -101,6 +103,9 @@ def test_a_model_comes_back_bit_for_bit(tmp_path, num_agents, policy, expert_lat
     assert (header["task"], header["extra"]) == ("fish-swim", [1, {"a": 2.5}])
     obs = np.ones((7, 2), F32)
     assert np.array_equal(found.encode(obs), model.encode(obs))
+    assert np.array_equal(found.latents(obs), model.latents(obs))
+    assert [*{key.split(".")[0] for key in model.params if key.startswith("_expert")}] == [
+        "_expert_encoder"] * (expert_latent_dim > 0)  # neither its policy nor its dynamics
 
 
 def test_an_expert_is_stored_with_the_shapes_of_torch(expert_file):
@@ -263,6 +268,36 @@ def test_wrong_model_settings_name_the_file(tmp_path, expert_file, changes, part
     header["model"].update(changes)
     path = write_raw(tmp_path / "m.npz", header, arrays)
     refusal(lambda: fac.load_model(path), path, "header: model", *parts)
+
+
+def test_earlier_students_that_hold_their_expert_s_policy_are_refused_in_a_line(tmp_path):
+    """Whatever else they hold; other models of that time said that they have none, and load."""
+    for kind in ("student", "expert"):
+        model = make_model(3) if kind == "student" else make_model(1, True)
+        fac.save_model(tmp_path / "m.npz", model, {"kind": kind})
+        header, arrays = contents(tmp_path / "m.npz")
+        assert "expert_mlp_dim" not in header["model"]
+        header["model"]["expert_mlp_dim"] = 0
+        found, read = fac.load_model(write_raw(tmp_path / "m.npz", header, arrays))
+        assert found.config == model.config and "expert_mlp_dim" not in read["model"]
+        header["model"]["expert_mlp_dim"] = 512
+        more = {**arrays, "_expert_pi.0.weight": np.zeros((512, 5), F32)}
+        for held in (arrays, more):
+            path = write_raw(tmp_path / "m.npz", header, held)
+            refusal(lambda path=path: fac.load_model(path), path, "earlier version",
+                    "distil it again")
+
+
+@pytest.mark.parametrize("key", ["_prior.4.bias", "_prior_encoder.0.weight"])
+def test_a_student_s_file_without_its_priors_is_refused(tmp_path, key):
+    fac.save_model(tmp_path / "m.npz", make_model(3, False, 13, 4), {"kind": "student"})
+    header, arrays = contents(tmp_path / "m.npz")
+    del arrays[key]
+    path = write_raw(tmp_path / "m.npz", header, arrays)
+    refusal(lambda: fac.load_model(path), path, key, "missing")
+    header["model"]["prior_steps"] = 0  # or with ones that it doesn't tell of
+    path = write_raw(tmp_path / "m.npz", header, arrays)
+    refusal(lambda: fac.load_model(path), path, "_prior", "unknown entry")
 
 
 # load_model ---------------------------------------------------------------------------

@@ -860,7 +860,9 @@ def test_a_csv_without_a_row_is_begun_anew(tmp_path, left):
 
 
 def short_expert_episodes(monkeypatch):
-    """Two of ones instead of reacher's 96."""
+    """Two of ones instead of reacher's 96, and priors as they begin."""
+    monkeypatch.setattr(fac, "teach_priors", lambda distiller, *_: {
+        "policy": fac.prior_weights(distiller.student)})
     monkeypatch.setattr(fac, "expert_episodes", lambda *_: (np.ones((2, 500, 8)),
                                                             np.ones((2, 500, 3))))
 
@@ -1156,8 +1158,6 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
     monkeypatch.setattr(fac.Distiller, "step", lambda self: (steps.append(1), step(self))[1])
     monkeypatch.setattr(fac.Distiller, "ranks", lambda *_: (np.full(4, 0.5), np.full(4, 0.25)))
     monkeypatch.setattr(students, "EVALUATION_SEEDS", (0, 1))  # whose expert is on record
-    monkeypatch.setattr(fac, "teach_priors", lambda distiller, *_: {
-        "policy": fac.prior_weights(distiller.student)})
     monkeypatch.setattr(fac, "choose_by_playing", lambda distiller, task, taught, plannings, *_: (
         plannings[-2], []))  # narrow
     monkeypatch.setattr(fac, "time_both", lambda *_: {

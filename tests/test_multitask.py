@@ -118,6 +118,26 @@ def test_agents_that_a_robot_lacks_change_nothing(data, task):
     assert all(np.array_equal(again.params[key], own.params[key]) for key in own.params)
 
 
+@pytest.mark.parametrize("centralized", [False, True])
+def test_a_task_s_student_may_begin_where_its_teacher_s_policy_does(data, centralized):
+    """Without a teacher it has nothing to begin from."""
+    with distiller_of(data, centralized=centralized) as distiller:
+        teacher, student = distiller.teachers["walker-walk"].expert, distiller.student
+    own, alone = student.of_task("walker-walk", teacher), student.of_task("walker-walk")
+    obs = np.random.default_rng(0).standard_normal((3, 24)).astype(np.float32)
+    reflex = fac.PlannerConfig(prior="own", iterations=0)
+    search = fac.PlannerConfig(prior="own", samples=8, iterations=1, horizon=2)
+    for seen in obs:
+        rollout = fac.policy_rollout(teacher, teacher.encode(seen[:, None]), [np.float32(0)] * 3)
+        found = own.prior(own.latents(seen[:, None]), 3)[..., 0]
+        assert np.array_equal(found, rollout.reshape(3, len(found), -1).swapaxes(0, 1))
+        assert np.array_equal(fac.Planner(own, reflex).act(seen), rollout[0, 0, :, 0])
+    last = fac.dataclasses.replace(search, prior="last")
+    assert np.array_equal(fac.Planner(own, last).act(obs[0]), fac.Planner(alone, last).act(obs[0]))
+    with pytest.raises(fac.UserError, match="no prior for plans"):
+        fac.Planner(alone, search)
+
+
 @pytest.mark.parametrize("task", ROBOTS)
 @pytest.mark.parametrize("centralized", [False, True])
 def test_a_task_s_student_is_what_the_mask_leaves(data, task, centralized):
@@ -297,9 +317,8 @@ def test_evaluate(data, student, short_episodes):
         prior="own", iterations=0), 2, 0, 0)["returns"]
     assert found["kept"] == fac.return_kept(np.mean(found["returns"]),
                                             np.mean(found["teacher_returns"]))
-    for prior, returns in (("policy", found), ("none", alone["tasks"]["walker-walk"])):
-        planning = fac.PlannerConfig(horizon=1, **(fac.STUDENT_PLANNING if prior == "policy"
-                                                   else {}))
+    for search, returns in ((fac.STUDENT_PLANNING, found), ({}, alone["tasks"]["walker-walk"])):
+        planning = fac.PlannerConfig(horizon=1, **search)
         played = fac.evaluate(model.of_task("walker-walk", expert), "walker-walk", planning, 2, 0,
                               0)["returns"]
         assert played == returns["returns"]

@@ -336,6 +336,56 @@ def test_expert_and_student_learn_over_their_own_horizons(horizon, monkeypatch):
         seen.clear()
 
 
+def test_an_online_student_s_priors_learn_what_the_policy_does_now(monkeypatch):
+    """In its batch's states, at its rate; Algorithm 1's weights are those of one without priors."""
+    expert = fac.WorldModel.create(fac.ModelConfig(8, 3, 1, 4, 6, 6), np.random.default_rng(0),
+                                   policy=True)
+    own, seen = train_expert.ReplayBuffer(8, 3, fac.EPISODE_STEPS), []
+    config = fac.DistillConfig(batch_size=32, lr=5e-3, warmup=1, steps=400)
+    student, plain = (train_expert.OnlineStudent(expert, 3, fac.dataclasses.replace(
+        config, priors=priors), 0, own) for priors in (True, False))
+    assert [*student.optimizers] == ["student", "priors"] and [*plain.optimizers] == ["student"]
+    rng, loss = np.random.default_rng(0), fac.prior_loss
+    monkeypatch.setattr(fac, "prior_loss", lambda *args: (
+        seen.append((loss(*args), args[1:3])), seen[-1][0])[1])
+    for t in range(200):
+        if t == 100:  # an expert that has learned: nothing of it is kept
+            expert.params["_pi.4.bias"] += 0.5
+        obs = rng.standard_normal((8, 40)).astype(np.float32)
+        actions = rng.uniform(-1, 1, (4, 3, 40)).astype(np.float32)
+        for one in (student, plain):
+            one.update(expert, obs.copy(), actions)
+        _, (x, plans) = seen[t]
+        assert np.array_equal(x, student.model.read(obs[:, :32]))
+        assert np.array_equal(plans, fac.policy_plan(expert, obs[:, :32], 4, student.model.config))
+    assert len(seen) == 200 and seen[99][0] < seen[0][0] / 3 and seen[199][0] < seen[100][0] / 3
+    assert np.array_equal(student.optimizer.vector, plain.optimizer.vector)
+    assert student.model.config.prior_steps == 4 and plain.model.config.prior_steps == 0
+
+
+def test_an_online_student_s_priors_go_on_bit_for_bit(tmp_path):
+    whole, again = training(), training()
+    for found in (whole, again):
+        found.buffer.add(*episode(np.random.default_rng(0), 1))
+    for _ in range(3):
+        whole.learn()
+    (tmp_path / "run").mkdir()
+    whole.save(tmp_path / "run")
+    _, arrays = fac.read_npz(tmp_path / "run" / "checkpoint.npz", ("checkpoint",))
+    assert {"priors weights", "priors adam_m", "priors adam_v", "priors step"} <= {*arrays}
+    before = fac.flatten(fac.prior_weights(whole.student.model))[0]
+    assert np.array_equal(arrays["priors weights"], before) and arrays["priors step"] == 3
+    again.load(tmp_path / "run" / "checkpoint.npz")
+    for found in (whole, again):
+        for _ in range(2):
+            found.learn()
+    after, other = (fac.flatten(fac.prior_weights(found.student.model))[0]
+                    for found in (whole, again))
+    assert np.array_equal(after, other) and not np.array_equal(after, before)
+    for key, value in whole.student.model.params.items():
+        assert np.array_equal(value, again.student.model.params[key]), key
+
+
 class Still:
     """Stands for `Actors`: notes what it is asked for; every episode is of ones."""
 
