@@ -27,9 +27,9 @@ def choose_renderer():
                         "OSMesa (libosmesa6)")
 
 
-def shares(model, obs, config):
-    """What a plan that each agent makes anew from obs (O, 1) is worth above doing nothing (N,)."""
-    n, latents = model.config.num_agents, model.latents(obs)
+def shares(model, latents, config):
+    """What a plan that each agent makes anew from its latent is worth above doing nothing (N,)."""
+    n = model.config.num_agents
     returns = functools.partial(fac.h_step_return, model, latents[:, :model.config.latent_dim],
                                 config=config)
     nothing = np.zeros((n, config.horizon + 1, model.config.agent_actions), fac.F32)
@@ -48,8 +48,8 @@ def watch_episode(path, model, header, task, seed, decisions, every):
     obs, actions, rewards, seconds = (x[0] for x in fac.play(
         model, task, config, [seed], label=f"playing {path}", environment=environment))
     pictures = frames_at(task, seed, actions, range(0, decisions, every), config.action_repeat)
-    frames = [(picture, shares(model, seen, config), rewards[:t].sum())
-              for t, picture in pictures.items() for seen in [obs[t][:, None]]]
+    frames = [(picture, shares(model, model.latents(obs[t][:, None]), config), rewards[:t].sum())
+              for t, picture in pictures.items()]
     name = f"{header['kind']}, N = {model.config.num_agents}"
     return frames, name, 1e3 * float(np.median(seconds)), float(rewards.sum())
 
