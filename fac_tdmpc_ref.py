@@ -2133,8 +2133,8 @@ def choose_by_playing(distiller, task, taught, plannings, workers=None, environm
     """Which priors of `teach_priors` a student keeps, and which of the plannings, cheapest first,
     it searches around them by: all play the same episodes, a sixth as many as the expert's policy
     played; first the priors alone, then each search around the better ones. The best mean is kept,
-    or what is cheaper and, by the differences of episodes, within a standard error of it. Returns
-    the planning and what was played, a list of dicts; the student has the priors."""
+    or what is cheaper and, by the differences of episodes, within a standard error or a hundredth
+    of it. Returns the planning and what was played, a list of dicts; the student has the priors."""
     played, student = [], distiller.student
     seeds = training_seeds(distiller.seed, "choice", 0, -(-distiller.config.expert_episodes // 6))
 
@@ -2153,8 +2153,9 @@ def choose_by_playing(distiller, task, taught, plannings, workers=None, environm
         return plannings[-1], played
     found = [alone[best] if planning.iterations == 0 else returns(best, planning)
              for planning in plannings]
-    behind = max(found, key=np.mean) - np.array(found)
-    within = behind.mean(1) <= behind.std(1) / max(1, len(seeds) - 1) ** 0.5
+    behind = (highest := max(found, key=np.mean)) - np.array(found)
+    error = behind.std(1) / max(1, len(seeds) - 1) ** 0.5
+    within = behind.mean(1) <= np.maximum(error, abs(highest.mean()) / 100)
     student.params.update(taught[best])
     return plannings[int(np.argmax(within))], played
 
