@@ -2522,7 +2522,7 @@ def report(result, plannings):
     q, g = (result[f"rank_correlation_{key}"] for key in ("by_step", "returns"))
     kept = "-" if result["kept"] is None else f"{result['kept']:.2f}"
     print(f"\nreturn kept {kept}, rank correlation of Q {q[0]:.3f} (h = 0) to {q[-1]:.3f} (h = "
-          f"{len(q) - 1}), of the return {g[-1]:.3f}; Algorithm 1 took "
+          f"{len(q) - 1}), of the return {g[-1]:.3f}; distilled in "
           "{seconds:.0f} s, {seconds_total:.0f} s in all, {out}/".format_map(result))
 
 
@@ -2660,6 +2660,9 @@ def make_parser():
     add("--episodes", type=positive, default=20, help="evaluation episodes [20]")
     add("--workers", type=natural, help="processes that play episodes; 0: this one [cores]")
     add_config(sub, DistillConfig)
+    for flag, name in (("--own-episodes", "expert_episodes"), ("--own-share", "played_share")):
+        add(flag, dest=f"DistillConfig.{name}", type=int, choices=[0],  # of earlier scripts
+            help=argparse.SUPPRESS)
     add_config(sub, PlannerConfig, "How the student plans; the expert does with its own defaults",
                "plan-", ("horizon", "action_repeat"), **STUDENT_PLANNING)
 
