@@ -2522,7 +2522,7 @@ def report(result, plannings):
     q, g = (result[f"rank_correlation_{key}"] for key in ("by_step", "returns"))
     kept = "-" if result["kept"] is None else f"{result['kept']:.2f}"
     print(f"\nreturn kept {kept}, rank correlation of Q {q[0]:.3f} (h = 0) to {q[-1]:.3f} (h = "
-          f"{len(q) - 1}), of the return {g[-1]:.3f}; distilled in "
+          f"{len(q) - 1}), of the return {g[-1]:.3f}; Algorithm 1 distilled in "
           "{seconds:.0f} s, {seconds_total:.0f} s in all, {out}/".format_map(result))
 
 
