@@ -432,7 +432,8 @@ def quick(files, tmp_path, monkeypatch, capsys):
     student, header, plannings that were tried, (model, planning)s that were evaluated."""
     arguments = distill_arguments(files, "--workers", "0", "--json", "--out", tmp_path / "out")
     own = arguments.index("--plan-samples")
-    arguments = [str(a) for a in arguments[:own] + arguments[own + 4:]]
+    arguments = [*map(str, arguments[:own] + arguments[own + 4:]), "--expert-episodes", "2",
+                 "--played-share", "0.5"]
     returns = [{"taught": "plans", **dict.fromkeys(fac.CHOSEN, 1), "returns": [2.0]}]
 
     def distill(*flags, taught=0.5, chosen=-1):
@@ -452,6 +453,7 @@ def quick(files, tmp_path, monkeypatch, capsys):
             for name, stands in {
                     "teach_priors": taught and teach, "choose_by_playing": taught and choose,
                     "play": None, "learn_priors": None, "time_both": lambda *_: {},
+                    "expert_episodes": lambda *_: (np.zeros((2, 9, 8)), np.zeros((2, 9, 3))),
                     "report": lambda *_: None, "draw_curve": lambda *_: True,
                     "evaluate_both": lambda expert, student, *_: evaluated.append(student) or {},
             }.items():
