@@ -193,7 +193,7 @@ class Run:
             return imagined_return(self.model, state, actions, self.config.discount)
         mean, elites, scores = fac.mppi(returns, self.mean, self.config, self.rngs)
         self.mean = np.concatenate([mean[:, 1:], np.zeros_like(mean[:, :1])], axis=1)
-        return fac.draw_elite(elites, scores, self.rngs)
+        return fac.draw_elite(elites, scores, self.rngs)[:, 0]
 
     def step(self):
         """Plan and move. The arm itself is the joints and the actuator, whatever the model."""
