@@ -1307,8 +1307,6 @@ class Returns:
         return np.tanh(y, out=y).reshape(shape)
 
 
-
-
 class FastPlanner(AgentPlanner):
     """`AgentPlanner` with `Returns`, unless its config says plain, or it can't know a client's
     networks. UserError: no finite G."""
@@ -1661,8 +1659,6 @@ def robot_step(robot, action, sizes, t):
     need(np.isfinite(number), f"decision {t}: expected a finite reward, found {shown(reward)}")
     obs = checked(obs, (sizes.dim_obs,), f"decision {t}: observation")
     return obs, number, any(ends), any(ends[:1])
-
-
 
 
 def lookup_task(task):
@@ -2180,7 +2176,7 @@ def train_student(distiller, out, settings, planning, workers):
         except (LookupError, TypeError, ValueError, OverflowError) as error:
             raise UserError(f"{checkpoint}: damaged ({error!r}); delete it to start anew") from None
     elif not (out / "student.npz").exists():
-        need_none(out, "config.json", "result.json", "curve.csv", "curve.png")
+        need_none(out, "config.json", "result.json", "curve.csv")
     began, saved = time.monotonic(), -np.inf
     if not distiller.t and config.expert_episodes:
         distiller.add(*expert_episodes(distiller, settings["task"], planning, workers))
@@ -2248,54 +2244,6 @@ def optional(library, extra):
                         ) from None
 
 
-def pyplot():
-    """matplotlib.pyplot, in this project's style, without a display; UserError if missing."""
-    os.environ.pop("MPLBACKEND", None)  # a notebook's, which may not be here
-    with optional("matplotlib", "plots"):
-        import matplotlib
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-    cycle = matplotlib.cycler(  # told apart in black and white, too
-        color=["#0072b2", "#d55e00", "#009e73", "#333333", "#cc79a7", "#e69f00", "#56b4e9"],
-        linestyle=["-", "--", "-.", ":", "-", "--", "-."])
-    plt.rcParams.update({"axes.grid": True, "grid.alpha": 0.3, "axes.prop_cycle": cycle,
-                         "text.usetex": False})
-    return plt
-
-
-def save_figure(path, figure):
-    """Write a figure as PNG and forget it."""
-    with atomic_file(path) as file:
-        figure.savefig(file, dpi=110, format="png")
-    pyplot().close(figure)
-
-
-def drawn(draw, path, *what):
-    """Whether draw(path, ...) made its picture; what goes wrong is said, and costs nothing else."""
-    try:
-        draw(path, *what)
-        return True
-    except Exception as error:
-        print(f"{path}: no picture: {' '.join(str(error).split())[:300]}", file=sys.stderr)
-        return False
-
-
-def draw_curve(path, curve, title):
-    """Losses and rank correlations over the steps."""
-    columns = dict(zip(CURVE, np.array(curve).T))
-    figure, axes = pyplot().subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-    for ax, lines in zip(axes, ({"kl_reward": "rewards", "kl_value": "values"}, {
-            "rank_correlation_h0": "Q, h = 0", "rank_correlation_last": "Q, h = H",
-            "rank_correlation_return": "return G"})):
-        for key, label in lines.items():
-            ax.plot(columns["step"], columns[key], label=label)
-        ax.set(xlabel="gradient step")
-        ax.legend()
-    axes[0].set(yscale="log", ylabel="KL divergence", title=title)
-    axes[1].set(ylim=(None, 1), ylabel="rank correlation", title="held-out states")
-    save_figure(path, figure)
-
-
 def read_records(path):
     """{`record_key`: (returns, the `software` they are of)} of the .json beside a model's file."""
     path = Path(path).with_suffix(".json")
@@ -2361,10 +2309,7 @@ def command_distill(args):
             Planner(*planned)  # what is missing, or too large, is missed now
         result, planning = distil_and_save(distiller, args, planning, header, out)
         obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
-        both = (expert, own), (distiller.student, planning)
-        result.update(evaluate_both(*both, path, args))
-        write_json(out / "result.json", result)  # if no more can be had, as timing needs processes
-        result.update(time_both(*both, obs))
+        result.update(compare((expert, own), (distiller.student, planning), obs, path, args))
         result.update(seconds_total=round(result["seconds_total"] + time.monotonic() - began, 1))
         write_json(out / "result.json", result)
     report(result, (own, planning))
@@ -2430,35 +2375,30 @@ def distil_and_save(distiller, args, planning, header, out):
             "steps": config.steps, "seconds": round(seconds, 1), "seconds_total": before,
             "kl_reward": curve[-1][3], "kl_value": curve[-1][4], "rank_correlation": q[0],
             "rank_correlation_by_step": q, "rank_correlation_returns": g, "played": played,
-            **{name: getattr(planning, name) for name in CHOSEN}, "out": str(out),
-            "picture": drawn(draw_curve, out / "curve.png", curve,
-                             f"{args.task}, seed {args.seed}")}, planning
+            **{name: getattr(planning, name) for name in CHOSEN}, "out": str(out)}, planning
 
 
 COMPARED = {"expert": "the expert", "student": "the student", "policy": "its policy alone",
-            "same_search": "expert, searching like its student", "reflex": "its priors alone"}
+            "reflex": "its priors alone"}
 
 
 def compared(expert, student):
     """What distill compares, (model, planning) by COMPARED's keys: these two; the expert's policy
-    alone; if the student searches, its priors alone, and the expert searching around its policy
-    like it around these: what the model alone saves [D9]."""
+    alone; and, if the student searches, its priors alone."""
     (model, own), (learner, planning) = expert, student
     found = {"expert": expert, "student": student}
     if model.has_policy:
         found["policy"] = model, dataclasses.replace(own, prior="own", iterations=0)
     if planning.prior == "own" and planning.iterations:
         found["reflex"] = learner, dataclasses.replace(planning, iterations=0)
-        search = {name: getattr(planning, name) for name in SEARCH}
-        found["same_search"] = model, dataclasses.replace(own, **{**search, "pi_trajs": 0})
     return found
 
 
-def evaluate_both(expert, student, path, args):
-    """The returns of all that is `compared`, from the record beside the expert's file `path`, or
-    measured: result's part. expert, student: (model, planning), each over its own horizon."""
+def compare(expert, student, obs, path, args):
+    """Of all that is `compared` the returns, from the record beside the expert's file `path` or
+    measured, and the milliseconds of a decision in this process: result's part."""
     found = {"episodes": args.episodes, "eval_seed": args.eval_seed}
-    for name, (model, planning) in compared(expert, student).items():
+    for name, (model, planning) in (each := compared(expert, student)).items():
         returns, versions = recorded_returns(path, model, args.task, planning, args.eval_seed)
         recorded = len(returns) >= args.episodes and not args.evaluate_expert
         if not recorded:
@@ -2470,27 +2410,11 @@ def evaluate_both(expert, student, path, args):
                  "return_std": float(np.std(returns)), "horizon": planning.horizon,
                  "recorded": recorded, "versions": versions}
         found.update({f"{name}_{key}": value for key, value in about.items()})
-    return {**found, "kept": return_kept(found["student_return_mean"], found["expert_return_mean"])}
-
-
-def time_both(expert, student, obs):
-    """Milliseconds of a decision with all that is `compared`, in this process, and of the student
-    with a process on each core; where that costs more than it saves, or can't be (in a pool's
-    process, under a profiler), it counts as planning in one. For result."""
-    workers = useful_workers(student[0].config.num_agents)
-    with contextlib.ExitStack() as stack:
-        acts = {name: stack.enter_context(Planner(*planned)).act
-                for name, planned in compared(expert, student).items()}
-        with contextlib.suppress(UserError):
-            if workers:
-                acts["workers"] = stack.enter_context(Planner(*student, workers=workers)).act
-        seconds = interleaved_seconds([functools.partial(act, obs) for act in acts.values()], 20,
-                                      "timing")
-    ms = dict(zip(acts, (1e3 * np.median(seconds, 0)).tolist()))
-    alone, beside = ms.pop("student"), ms.pop("workers", np.inf)
-    return {**{f"plan_ms_{name}": value for name, value in ms.items()},
-            "plan_ms_student_in_process": alone, "plan_ms_student": (best := min(alone, beside)),
-            "speedup": ms["expert"] / best, "plan_workers": workers if best < alone else 0}
+    calls = [functools.partial(Planner(*of).act, obs) for of in each.values()]
+    ms = 1e3 * np.median(interleaved_seconds(calls, 20, "timing"), 0)
+    found.update({f"plan_ms_{name}": float(value) for name, value in zip(each, ms)})
+    return {**found, "speedup": found["plan_ms_expert"] / found["plan_ms_student"],
+            "kept": return_kept(found["student_return_mean"], found["expert_return_mean"])}
 
 
 def report(result, plannings):
@@ -2500,28 +2424,22 @@ def report(result, plannings):
     own, search = (f"{of.samples} x {of.iterations}" if of.iterations else "0" for of in plannings)
     print("\n{task}, {episodes} episodes, evaluation seed {eval_seed}, horizon {expert_horizon} "
           "and {student_horizon}\n".format_map(result))
-    expert, student = f"expert ({source}), one process", f"student, N = {result['num_agents']}"
-    rows = [("", "MPPI", "return", "ms a decision", "speed-up")]
-    for name, budget, who, timed in (
-            (f"{expert}, H = {result['expert_horizon']}", own, "expert", "expert"),
-            (COMPARED["policy"], "0", "policy", "policy"),
-            (COMPARED["same_search"], search, "same_search", "same_search"),
-            (f"{student}, its priors alone", "0", "reflex", "reflex"),
-            (f"{student}, one process, H = {result['student_horizon']}", search, "student",
-             "student_in_process"),
-            (f"student, workers beside: {result['plan_workers']}", "", "",
-             "student" if result["plan_workers"] else "nowhere")):
-        if ms := result.get(f"plan_ms_{timed}"):  # or it isn't `compared`
+    rows, student = [("", "MPPI", "return", "ms a decision", "speed-up")], (
+        f"student, N = {result['num_agents']}")
+    for who, name, budget in (("expert", f"expert ({source})", own),
+                              ("policy", COMPARED["policy"], "0"),
+                              ("reflex", f"{student}, its priors alone", "0"),
+                              ("student", student, search)):
+        if ms := result.get(f"plan_ms_{who}"):  # or it isn't `compared`
             rows.append((name, budget, f"{result[f'{who}_return_mean']:.0f} ± "
-                         f"{result[f'{who}_return_std']:.0f}" if who else "the same plans",
-                         f"{ms:.1f}", f"{result['plan_ms_expert'] / ms:.1f}"))
+                         f"{result[f'{who}_return_std']:.0f}", f"{ms:.1f}",
+                         f"{result['plan_ms_expert'] / ms:.1f}"))
     print_table(rows)
     if result["played"]:
         report_played(result)
-    q, g = (result[f"rank_correlation_{key}"] for key in ("by_step", "returns"))
     kept = "-" if result["kept"] is None else f"{result['kept']:.2f}"
-    print(f"\nreturn kept {kept}, rank correlation of Q {q[0]:.3f} (h = 0) to {q[-1]:.3f} (h = "
-          f"{len(q) - 1}), of the return {g[-1]:.3f}; Algorithm 1 took "
+    print(f"\nreturn kept {kept}, rank correlation of the return "
+          f"{result['rank_correlation_returns'][-1]:.3f}; Algorithm 1 took "
           "{seconds:.0f} s, {seconds_total:.0f} s in all, {out}/".format_map(result))
 
 

@@ -35,6 +35,7 @@ import numpy as np
 sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
 import fac_tdmpc_ref as fac  # noqa: E402
 import look  # noqa: E402
+import plots  # noqa: E402
 import speed  # noqa: E402
 import students  # noqa: E402
 from baselines import DecodingEnvironment, distiller_of  # noqa: E402
@@ -394,7 +395,7 @@ def time_students(path, tasks):
             theirs = planning_for(header, fac.preset_values(fac.PlannerConfig, preset))
             planning = planning_for(about, {"samples": samples, "iterations": iterations})
             obs = np.random.default_rng(0).standard_normal(student.config.dim_obs, fac.F32)
-            ms = fac.time_both((expert, theirs), (student, planning), obs)
+            ms = students.time_both((expert, theirs), (student, planning), obs)
             for row, found in own:
                 row["ranks"] = json.dumps({**found, **{
                     key: ms[key] for key in ms if key.startswith(students.MEASURED)}})
@@ -830,7 +831,7 @@ def command_report(args):
     """report: every figure that has runs."""
     results, figures, result, text = Path(args.results), Path(args.figures), {}, []
     figures_from = os.path.relpath(figures, results)
-    fac.pyplot()
+    plots.pyplot()
     for name, make in REPORTS.items():
         if finished(read_rows(results / f"{name}.csv")):
             try:

@@ -1,4 +1,5 @@
-"""Section 5.6: look into a model: `experiments.py watch`, `figure9` and `agreement` are here."""
+"""Section 5.6: look into a model, or at how it learned: `experiments.py watch`, `figure9`,
+`agreement` and `curve` are here."""
 import copy
 import functools
 import os
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import fac_tdmpc_ref as fac
+import plots
 
 PIXELS, BARS, TEXT = 240, 70, 34  # a picture's side, width of the bars beside, height of the text
 RENDERERS = "from dm_control import suite; suite.load('reacher', 'easy').physics.render(8, 8)"
@@ -84,7 +86,7 @@ def command_watch(args):
     fac.need(kind in (".gif", ".mp4") and not Path(args.out).is_dir(),
              f"{args.out}: expected the name of a .gif or .mp4 file")
     fac.check_writable(args.out)
-    fac.pyplot()  # brings Pillow
+    plots.pyplot()  # brings Pillow
     if kind == ".mp4":
         with fac.optional("imageio for .mp4", "experiments"):
             import imageio_ffmpeg  # noqa: F401
@@ -123,17 +125,9 @@ def command_watch(args):
 
 # ------------------------------------------------------------------- Figure 9 and agreement
 
-def pyplot_for(path):
-    """matplotlib.pyplot; UserError, before the work, if no picture can be written there."""
-    fac.need(Path(path).suffix == ".png" and not Path(path).is_dir(),
-             f"{path}: expected the name of a .png file")
-    fac.check_writable(path)
-    return fac.pyplot()
-
-
 def need_plots(path):
-    """`pyplot_for`; UserError, before the work, if scikit-learn is missing, too."""
-    plt = pyplot_for(path)
+    """`plots.pyplot_for`; UserError, before the work, if scikit-learn is missing, too."""
+    plt = plots.pyplot_for(path)
     with fac.optional("scikit-learn", "experiments"):
         import sklearn  # noqa: F401
     return plt
@@ -264,7 +258,7 @@ def command_figure9(args):
             if t in pictures:
                 ax.imshow(pictures[t])
                 ax.set_title(f"decision {t}")
-    fac.drawn(fac.save_figure, args.out, figure)
+    plots.drawn(plots.save_figure, args.out, figure)
     result = {"out": args.out, "task": task, "episodes": args.episodes, "silhouette": apart,
               "silhouette_shuffled": shuffled, "silhouette_untrained": first,
               "return_best": float(returns.max()), "return_worst": float(returns.min()),
@@ -272,6 +266,36 @@ def command_figure9(args):
     if apart is not None:
         print(f"silhouette by agent {apart:.2f}, shuffled {shuffled:.2f}, untrained {first:.2f}")
     print(args.out)
+    return result
+
+
+def draw_curve(path, curve, title):
+    """Losses and rank correlations over the steps of a distillation."""
+    figure, axes = plots.pyplot().subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+    for ax, lines in zip(axes, ({"kl_reward": "rewards", "kl_value": "values"}, {
+            "rank_correlation_h0": "Q, h = 0", "rank_correlation_last": "Q, h = H",
+            "rank_correlation_return": "return G"})):
+        for key, label in lines.items():
+            ax.plot(curve["step"], curve[key], label=label)
+        ax.set(xlabel="gradient step")
+        ax.legend()
+    axes[0].set(yscale="log", ylabel="KL divergence", title=title)
+    axes[1].set(ylim=(None, 1), ylabel="rank correlation", title="held-out states")
+    plots.save_figure(path, figure)
+
+
+def command_curve(args):
+    """curve: the learning curve that `distill` left in a folder."""
+    path = Path(args.run_folder, "curve.csv")
+    out = args.out or path.with_suffix(".png")
+    plots.pyplot_for(out)
+    try:
+        curve = np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True))
+        fac.need(curve.dtype.names == fac.CURVE, f"found {curve.dtype.names}")
+    except (ValueError, fac.UserError) as error:
+        raise fac.UserError(f"{path}: not a curve of distill's ({error})") from None
+    result = {"out": str(out), "picture": plots.drawn(draw_curve, out, curve, args.run_folder)}
+    print(out)
     return result
 
 
@@ -328,7 +352,7 @@ def command_agreement(args):
              f"{args.model}: was distilled from another expert or replay; name them with --expert "
              "and --replay")
     fac.check_task(replay, task, f"{replay.path} (--replay)")
-    plt, rng = pyplot_for(args.out), np.random.default_rng(args.seed)
+    plt, rng = plots.pyplot_for(args.out), np.random.default_rng(args.seed)
     config = fac.PlannerConfig(**fac.made_for(header, args.model))
     about = {k: v for k, v in (header.get("distill") or {}).items() if k == "held_out"}
     share = fac.from_dict(fac.DistillConfig, about, args.model).held_out
@@ -353,7 +377,7 @@ def command_agreement(args):
     ax.set(xlabel="decision", ylabel="rank correlation with the expert's Q", ylim=(None, 1),
            title=f"{task}, the worst of {args.episodes} episodes: {rewards[worst].sum():.0f}")
     ax.legend(ncols=1 + len(own) // 8)
-    fac.drawn(fac.save_figure, args.out, figure)
+    plots.drawn(plots.save_figure, args.out, figure)
     result = {"out": args.out, "task": task, "held_out": known.mean(1).tolist(),
               "worst_episode": own.mean(1).tolist(), "when": when.tolist(),
               "return_worst": float(rewards[worst].sum()), "ceiling": ceiling,
@@ -378,8 +402,12 @@ def open_model(args, **kinds):
 
 
 def add_commands(commands):
-    """The three sub-commands' arguments."""
+    """The four sub-commands' arguments."""
     positive = functools.partial(fac.natural, least=1)
+    sub = fac.add_command(commands, "curve", command_curve, "A distillation's learning curve as a "
+                          "picture: losses, and rank correlations in held-out states.")
+    sub.add_argument("run_folder", metavar="RUN", help="a folder of distill's, runs/TASK-SEED")
+    sub.add_argument("--out", help="the picture [RUN/curve.png]")
     sub = fac.add_command(
         commands, "watch", command_watch, "An episode as a moving picture: beside the robot a bar "
         "for each agent, what a plan made anew is worth above doing nothing (each model has its "

@@ -25,6 +25,7 @@ import numpy as np
 
 sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
 import fac_tdmpc_ref as fac  # noqa: E402
+import plots  # noqa: E402
 from numpy_learner import ExpertConfig, Learner, named, unnamed  # noqa: E402
 from tables import draw_lines  # noqa: E402
 
@@ -699,7 +700,7 @@ def export(training, out, result):
                        ("eval_student", "student")):
         points = {row["decisions"]: [row[key]] for row in training.curve if row[key] is not None}
         lines.update({label: points} if points else {})
-    fac.drawn(draw_lines, out / "curve.png", {f"{args.task}, seed {args.seed}": (lines, None)},
+    plots.drawn(draw_lines, out / "curve.png", {f"{args.task}, seed {args.seed}": (lines, None)},
               "decisions")
     print(f"\n{args.task}: {training.decisions:,} decisions, {result['updates']:,} updates, "
           f"{training.seconds / 60:.1f} minutes; {args.episodes} evaluation episodes\n")
