@@ -1564,13 +1564,11 @@ def is_gym(task):
 
 
 def make_robot(task, action_repeat=None):
-    """The robot of a task: dm_control's, an `Environment`, or data/gym_robot.py's of gym:ID."""
+    """The robot of a task: dm_control's, an `Environment`, or gym_robot.py's of gym:ID."""
     repeat = task_repeat(task) if action_repeat is None else action_repeat
     if not is_gym(task):
         return Environment(task, repeat)
-    if str(DATA) not in sys.path:
-        sys.path.append(str(DATA))
-    with optional("gymnasium, and a clone of the repository", "gym"):
+    with optional("gymnasium", "gym"):
         from gym_robot import GymRobot
     try:
         return GymRobot(task.removeprefix("gym:"), repeat)
@@ -1593,18 +1591,31 @@ class Environment:
 
     def __init__(self, task, action_repeat=ACTION_REPEAT, render=False):
         self.action_repeat, self.episode_steps = action_repeat, episode_steps(action_repeat)
-        domain, name, self.dim_obs, self.dim_action = lookup_task(task)
-        need(not is_gym(task), f"{task}: distill, evaluate and train_expert.py play "
-             "Gymnasium's; expected one of dm_control's here")
+        need(not is_gym(task), f"{task}: Gymnasium's; expected one of dm_control's here")
         suite, control, reacher = import_dm_control(render)
-        if domain == "reacher":
+        domain, _, name = str(task).partition("-")
+        if task in TASKS and domain == "reacher":
             need(REACHER.exists(), f"{REACHER}: no such file; run from a clone of the repository")
             self.env = control.Environment(
                 reacher.Physics.from_xml_string(REACHER.read_text("ascii")),
                 reacher.Reacher(REACHER_TARGET[name], random=0), time_limit=20)
         else:
-            self.env = suite.load(domain, name, task_kwargs={"random": 0})
+            known = ["-".join(names) for names in suite.ALL_TASKS]
+            near = difflib.get_close_matches(str(task), [*TASKS, *known], n=1, cutoff=0)
+            need(task in known, f"unknown task {task!r}; did you mean {near[0]!r}? Known tasks: "
+                 f"{TASK_NAMES}")
+            try:
+                self.env = suite.load(domain, name, task_kwargs={"random": 0})
+                self.env.reset()
+            except RuntimeError as error:
+                raise UserError(f"{task}: dm_control can't play it here ({error}); MUJOCO_GL=egl "
+                                "or osmesa may help") from None
+            steps = self.env._step_limit  # it has no public name
+            need(steps == CONTROL_STEPS, f"{task}: has {steps} control steps; expected "
+                 f"{CONTROL_STEPS}")
+        self.dim_obs = sum(int(np.prod(s.shape)) for s in self.env.observation_spec().values())
         spec = self.env.action_spec()
+        self.dim_action = spec.shape[0]
         self._low, self._scale = spec.minimum, (spec.maximum - spec.minimum) / 2
         self.close = self.env.close
 
@@ -1664,37 +1675,16 @@ def robot_step(robot, action, sizes, t):
 def lookup_task(task):
     """(domain, name, dim O, dim A) of a task; UserError with the nearest name otherwise."""
     task = str(task)
-    if is_gym(task):
-        return *task.split(":", 1), *gym_sizes(task)[:2]
-    return *task.split("-", 1), *(TASKS[task] if task in TASKS else suite_sizes(task))
+    return *task.split(":" if is_gym(task) else "-", 1), *robot_sizes(task)
 
 
 @functools.cache
-def gym_sizes(task, repeat=1):
-    """(dim O, dim A, T) of a task of Gymnasium's, from its robot; UserError: it can't be made."""
-    robot = make_robot(task, repeat)
-    robot.close()  # the one that plays may need what it holds
-    return robot.dim_obs, robot.dim_action, robot.episode_steps
-
-
-@functools.cache
-def suite_sizes(task):
-    """(dim O, dim A) of a task of dm_control's suite, DOMAIN-TASK, from its specs; UserError: it is
-    none, or its episodes can't be played."""
-    suite, *_ = import_dm_control()
-    known = {"-".join(names): names for names in suite.ALL_TASKS}
-    (near,) = difflib.get_close_matches(task, [*TASKS, *known], n=1, cutoff=0)
-    need(task in known, f"unknown task {task!r}; did you mean {near!r}? Known tasks: {TASK_NAMES}")
-    try:
-        env = suite.load(*known[task])
-        env.reset()
-    except RuntimeError as error:
-        raise UserError(f"{task}: dm_control can't play it here ({error}); MUJOCO_GL=egl or osmesa "
-                        "may help") from None
-    steps = env._step_limit  # it has no public name
-    need(steps == CONTROL_STEPS, f"{task}: has {steps} control steps; expected {CONTROL_STEPS}")
-    spec = env.observation_spec().values()
-    return sum(int(np.prod(s.shape)) for s in spec), int(np.prod(env.action_spec().shape))
+def robot_sizes(task):
+    """(dim O, dim A) of a task; UserError: it is none, or its episodes can't be played."""
+    if task in TASKS:
+        return TASKS[task]
+    with contextlib.closing(make_robot(task)) as robot:  # the one that plays may need what it holds
+        return robot.dim_obs, robot.dim_action
 
 
 def episode_seeds(seed, episodes, first=0):

@@ -47,8 +47,16 @@ CURVE = ("decisions", "updates", "seconds", "exploration_std", "horizon", "retur
 
 def task_steps(task, config):
     """T: decisions in an episode of a task, at most, with the action repeat of a PlannerConfig."""
-    repeat = config.action_repeat
-    return fac.gym_sizes(task, repeat)[2] if fac.is_gym(task) else fac.episode_steps(repeat)
+    return episode_length(task, config.action_repeat)
+
+
+@functools.cache
+def episode_length(task, repeat):
+    """The same, of an action repeat."""
+    if not fac.is_gym(task):
+        return fac.episode_steps(repeat)
+    with contextlib.closing(fac.make_robot(task, repeat)) as robot:
+        return robot.episode_steps
 
 
 class Episode:

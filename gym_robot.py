@@ -46,11 +46,13 @@ class GymRobot:
             os.chdir(ours)
 
     def __init__(self, name, action_repeat=1):
-        file = Path(__file__).with_name(f"{name.rpartition(':')[0]}.py")
-        theirs = (Path(folder, file.name)
-                  for folder in os.environ.get("PYTHONPATH", "").split(os.pathsep))
-        if file.exists() and any(path.exists() and not file.samefile(path) for path in theirs):
-            raise ValueError(f"{file} may be imported instead; give your module another name")
+        file, here = f"{name.rpartition(':')[0]}.py", Path(__file__).resolve().parent
+        ours = [path for path in (here / file, here / "data" / file) if path.exists()]
+        for folder in os.environ.get("PYTHONPATH", "").split(os.pathsep):
+            for path in ours if Path(folder, file).exists() else ():
+                if not path.samefile(Path(folder, file)):
+                    raise ValueError(f"{path} may be imported instead; give your module another "
+                                     "name")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that there is a newer version of the ID
             try:
