@@ -1028,7 +1028,6 @@ class Distiller:
         need((replay.dim_obs, replay.dim_action) == (theirs.dim_obs, theirs.dim_action),
              f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, {replay.dim_action}), the "
              f"expert expects ({theirs.dim_obs}, {theirs.dim_action}); pass its own task's replay")
-        need(not theirs.expert_latent_dim, "an expert has an encoder of its own; this is a student")
         self.expert, self.replay, self.config, self.seed = expert, replay, config, seed
         need(expert.has_policy or not (config.policy_share or config.expert_episodes or
                                        config.priors), "the expert has no policy to learn from; "
@@ -1123,11 +1122,6 @@ class Distiller:
     def add(self, observation, action):
         """Let episodes (E, T, O), (E, T, A), NaN past their ends, join `played`, the rows
         (all, O + A) of episodes of `lengths` [D8]; those of H decisions or fewer are left out."""
-        shapes = np.shape(observation), np.shape(action)
-        expected = [(*shapes[0][:2], n) for n in (self.replay.dim_obs, self.replay.dim_action)]
-        need([*shapes] == expected and len(shapes[0]) == 3, "played episodes: expected shapes "
-             f"(E, T, {expected[0][-1]}) and (E, T, {expected[1][-1]}), found "
-             f"{shapes[0]} and {shapes[1]}")
         episodes, L = np.concatenate([observation, action], 2), self.config.horizon + 1
         good = np.isfinite(observation).all(2) & (np.abs(action) <= 1).all(2)
         past = np.logical_and.accumulate(np.isnan(episodes).all(2)[:, ::-1], 1)[:, ::-1]
@@ -1350,11 +1344,6 @@ def split_agents(agents, workers):
 def cores():
     """Cores that this process may use, where the system tells (taskset, cpusets)."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def useful_workers(agents):
-    """As many processes beside this one as there are cores and agents for."""
-    return min(agents, cores()) - 1
 
 
 NO_ARRAY = TypeError, ValueError, RuntimeError  # of what NumPy can't take; the last is PyTorch's
@@ -1913,9 +1902,8 @@ def data_file(task, name):
     path = DATA / task / name
     if not path.exists():
         shipped = ", ".join(sorted(p.parent.name for p in DATA.glob("*/expert.npz"))) or "none"
-        raise UserError(f"{path}: no such file; the repository (a pip install doesn't) holds "
-                        f"{shipped}. Train one with 'python data/train_expert.py --task {task}' "
-                        f"there and copy its files here, or give distill --expert and --replay")
+        raise UserError(f"{path}: no such file; the repository holds {shipped}. Train one with "
+                        f"'python data/train_expert.py --task {task}', give --expert, --replay")
     return path
 
 

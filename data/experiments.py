@@ -533,7 +533,7 @@ def time_runs(runs, opened, rounds):
             model, header = opened(run)
             planning = planning_for(header, json.loads(run["settings"]))
             obs = np.random.default_rng(0).standard_normal(model.config.dim_obs, fac.F32)
-            for count in {0, fac.useful_workers(model.config.num_agents)}:
+            for count in {0, speed.useful_workers(model.config.num_agents)}:
                 with contextlib.suppress(fac.UserError if count else ()):  # none can be started
                     act = stack.enter_context(fac.Planner(model, planning, workers=count)).act
                     calls.append((run["case"], run["seed"], count > 0, functools.partial(act, obs)))

@@ -50,6 +50,11 @@ class Predictor(fac.Workers):
         self.receive_all()
 
 
+def useful_workers(agents):
+    """As many processes beside this one as there are cores and agents for."""
+    return min(agents, fac.cores()) - 1
+
+
 def _prediction_worker(connection):
     predict, done = Predictor(connection.recv()), pickle.dumps(None)
     while True:
@@ -184,7 +189,7 @@ def command_table3(args):
     prediction, decision, hand_overs = [], [], []
     for robot in args.robots:
         agents = ROBOTS[robot][1]
-        workers = (fac.useful_workers(agents) if args.workers is None
+        workers = (useful_workers(agents) if args.workers is None
                    else min(args.workers, agents - 1))
         prediction += benchmark_prediction(robot, workers, args.runs)
         rows, hand_over = benchmark_decisions(robot, workers, planning, args.runs // 10)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import fac_tdmpc_ref as fac
+from speed import useful_workers
 from tables import deviation, markdown, of_returns
 
 EVALUATION_SEEDS = (101, 102)  # which nothing was chosen by
@@ -42,7 +43,7 @@ def time_both(expert, student, obs):
     """Milliseconds of a decision with all that is `compared`, in this process, and of the student
     with a process on each core; where that costs more than it saves, or can't be (in a pool's
     process, under a profiler), it counts as planning in one."""
-    workers = fac.useful_workers(student[0].config.num_agents)
+    workers = useful_workers(student[0].config.num_agents)
     with contextlib.ExitStack() as stack:
         acts = {name: stack.enter_context(fac.Planner(*planned)).act
                 for name, planned in compared(expert, student).items()}
