@@ -1028,6 +1028,7 @@ class Distiller:
         need((replay.dim_obs, replay.dim_action) == (theirs.dim_obs, theirs.dim_action),
              f"{replay.path}: holds (dim O, dim A) = ({replay.dim_obs}, {replay.dim_action}), the "
              f"expert expects ({theirs.dim_obs}, {theirs.dim_action}); pass its own task's replay")
+        need(not theirs.expert_latent_dim, "an expert has an encoder of its own; this is a student")
         self.expert, self.replay, self.config, self.seed = expert, replay, config, seed
         need(expert.has_policy or not (config.policy_share or config.expert_episodes or
                                        config.priors), "the expert has no policy to learn from; "
