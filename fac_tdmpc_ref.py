@@ -2405,10 +2405,10 @@ def report(result, plannings):
           "and {student_horizon}\n".format_map(result))
     rows, student = [("", "MPPI", "return", "ms a decision", "speed-up")], (
         f"student, N = {result['num_agents']}")
-    for who, name, budget in (("expert", f"expert ({source})", own),
+    for who, name, budget in (("expert", f"expert ({source}), one process", own),
                               ("policy", COMPARED["policy"], "0"),
                               ("reflex", f"{student}, its priors alone", "0"),
-                              ("student", student, search)):
+                              ("student", f"{student}, one process", search)):
         if ms := result.get(f"plan_ms_{who}"):  # or it isn't `compared`
             rows.append((name, budget, f"{result[f'{who}_return_mean']:.0f} ± "
                          f"{result[f'{who}_return_std']:.0f}", f"{ms:.1f}",
