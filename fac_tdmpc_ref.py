@@ -1123,11 +1123,6 @@ class Distiller:
     def add(self, observation, action):
         """Let episodes (E, T, O), (E, T, A), NaN past their ends, join `played`, the rows
         (all, O + A) of episodes of `lengths` [D8]; those of H decisions or fewer are left out."""
-        shapes = np.shape(observation), np.shape(action)
-        expected = [(*shapes[0][:2], n) for n in (self.replay.dim_obs, self.replay.dim_action)]
-        need([*shapes] == expected and len(shapes[0]) == 3, "played episodes: expected shapes "
-             f"(E, T, {expected[0][-1]}) and (E, T, {expected[1][-1]}), found "
-             f"{shapes[0]} and {shapes[1]}")
         episodes, L = np.concatenate([observation, action], 2), self.config.horizon + 1
         good = np.isfinite(observation).all(2) & (np.abs(action) <= 1).all(2)
         past = np.logical_and.accumulate(np.isnan(episodes).all(2)[:, ::-1], 1)[:, ::-1]
@@ -1307,8 +1302,6 @@ class Returns:
         return np.tanh(y, out=y).reshape(shape)
 
 
-
-
 class FastPlanner(AgentPlanner):
     """`AgentPlanner` with `Returns`, unless its config says plain, or it can't know a client's
     networks. UserError: no finite G."""
@@ -1352,11 +1345,6 @@ def split_agents(agents, workers):
 def cores():
     """Cores that this process may use, where the system tells (taskset, cpusets)."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def useful_workers(agents):
-    """As many processes beside this one as there are cores and agents for."""
-    return min(agents, cores()) - 1
 
 
 NO_ARRAY = TypeError, ValueError, RuntimeError  # of what NumPy can't take; the last is PyTorch's
@@ -1595,18 +1583,31 @@ class Environment:
 
     def __init__(self, task, action_repeat=ACTION_REPEAT, render=False):
         self.action_repeat, self.episode_steps = action_repeat, episode_steps(action_repeat)
-        domain, name, self.dim_obs, self.dim_action = lookup_task(task)
-        need(not is_gym(task), f"{task}: distill, evaluate and train_expert.py play "
-             "Gymnasium's; expected one of dm_control's here")
+        need(not is_gym(task), f"{task}: Gymnasium's; expected one of dm_control's here")
         suite, control, reacher = import_dm_control(render)
-        if domain == "reacher":
+        domain, _, name = str(task).partition("-")
+        if task in TASKS and domain == "reacher":
             need(REACHER.exists(), f"{REACHER}: no such file; run from a clone of the repository")
             self.env = control.Environment(
                 reacher.Physics.from_xml_string(REACHER.read_text("ascii")),
                 reacher.Reacher(REACHER_TARGET[name], random=0), time_limit=20)
         else:
-            self.env = suite.load(domain, name, task_kwargs={"random": 0})
+            known = ["-".join(names) for names in suite.ALL_TASKS]
+            near = difflib.get_close_matches(str(task), [*TASKS, *known], n=1, cutoff=0)
+            need(task in known, f"unknown task {task!r}; did you mean {near[0]!r}? Known tasks: "
+                 f"{TASK_NAMES}")
+            try:
+                self.env = suite.load(domain, name, task_kwargs={"random": 0})
+                self.env.reset()
+            except RuntimeError as error:
+                raise UserError(f"{task}: dm_control can't play it here ({error}); MUJOCO_GL=egl "
+                                "or osmesa may help") from None
+            steps = self.env._step_limit  # it has no public name
+            need(steps == CONTROL_STEPS, f"{task}: has {steps} control steps; expected "
+                 f"{CONTROL_STEPS}")
+        self.dim_obs = sum(int(np.prod(s.shape)) for s in self.env.observation_spec().values())
         spec = self.env.action_spec()
+        self.dim_action = spec.shape[0]
         self._low, self._scale = spec.minimum, (spec.maximum - spec.minimum) / 2
         self.close = self.env.close
 
@@ -1663,42 +1664,19 @@ def robot_step(robot, action, sizes, t):
     return obs, number, any(ends), any(ends[:1])
 
 
-
-
 def lookup_task(task):
     """(domain, name, dim O, dim A) of a task; UserError with the nearest name otherwise."""
     task = str(task)
-    if is_gym(task):
-        return *task.split(":", 1), *gym_sizes(task)[:2]
-    return *task.split("-", 1), *(TASKS[task] if task in TASKS else suite_sizes(task))
+    return *task.split(":" if is_gym(task) else "-", 1), *robot_sizes(task)
 
 
 @functools.cache
-def gym_sizes(task, repeat=1):
-    """(dim O, dim A, T) of a task of Gymnasium's, from its robot; UserError: it can't be made."""
-    robot = make_robot(task, repeat)
-    robot.close()  # the one that plays may need what it holds
-    return robot.dim_obs, robot.dim_action, robot.episode_steps
-
-
-@functools.cache
-def suite_sizes(task):
-    """(dim O, dim A) of a task of dm_control's suite, DOMAIN-TASK, from its specs; UserError: it is
-    none, or its episodes can't be played."""
-    suite, *_ = import_dm_control()
-    known = {"-".join(names): names for names in suite.ALL_TASKS}
-    (near,) = difflib.get_close_matches(task, [*TASKS, *known], n=1, cutoff=0)
-    need(task in known, f"unknown task {task!r}; did you mean {near!r}? Known tasks: {TASK_NAMES}")
-    try:
-        env = suite.load(*known[task])
-        env.reset()
-    except RuntimeError as error:
-        raise UserError(f"{task}: dm_control can't play it here ({error}); MUJOCO_GL=egl or osmesa "
-                        "may help") from None
-    steps = env._step_limit  # it has no public name
-    need(steps == CONTROL_STEPS, f"{task}: has {steps} control steps; expected {CONTROL_STEPS}")
-    spec = env.observation_spec().values()
-    return sum(int(np.prod(s.shape)) for s in spec), int(np.prod(env.action_spec().shape))
+def robot_sizes(task):
+    """(dim O, dim A) of a task; UserError: it is none, or its episodes can't be played."""
+    if task in TASKS:
+        return TASKS[task]
+    with contextlib.closing(make_robot(task)) as robot:  # the one that plays may need what it holds
+        return robot.dim_obs, robot.dim_action
 
 
 def episode_seeds(seed, episodes, first=0):
@@ -1927,9 +1905,8 @@ def data_file(task, name):
     path = DATA / task / name
     if not path.exists():
         shipped = ", ".join(sorted(p.parent.name for p in DATA.glob("*/expert.npz"))) or "none"
-        raise UserError(f"{path}: no such file; the repository (a pip install doesn't) holds "
-                        f"{shipped}. Train one with 'python data/train_expert.py --task {task}' "
-                        f"there and copy its files here, or give distill --expert and --replay")
+        raise UserError(f"{path}: no such file; the repository holds {shipped}. Train one with "
+                        f"'python data/train_expert.py --task {task}', give --expert, --replay")
     return path
 
 
@@ -2249,52 +2226,28 @@ def optional(library, extra):
                         ) from None
 
 
-def pyplot():
-    """matplotlib.pyplot, in this project's style, without a display; UserError if missing."""
-    os.environ.pop("MPLBACKEND", None)  # a notebook's, which may not be here
-    with optional("matplotlib", "plots"):
-        import matplotlib
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-    cycle = matplotlib.cycler(  # told apart in black and white, too
-        color=["#0072b2", "#d55e00", "#009e73", "#333333", "#cc79a7", "#e69f00", "#56b4e9"],
-        linestyle=["-", "--", "-.", ":", "-", "--", "-."])
-    plt.rcParams.update({"axes.grid": True, "grid.alpha": 0.3, "axes.prop_cycle": cycle,
-                         "text.usetex": False})
-    return plt
-
-
-def save_figure(path, figure):
-    """Write a figure as PNG and forget it."""
-    with atomic_file(path) as file:
-        figure.savefig(file, dpi=110, format="png")
-    pyplot().close(figure)
-
-
-def drawn(draw, path, *what):
-    """Whether draw(path, ...) made its picture; what goes wrong is said, and costs nothing else."""
+def draw_curve(path, curve, title):
+    """Losses and rank correlations over the steps, as a picture; whether it could be made: what
+    goes wrong is said, and costs nothing else."""
+    columns = dict(zip(CURVE, np.array(curve).T))
     try:
-        draw(path, *what)
-        return True
+        with optional("matplotlib", "plots"):
+            from matplotlib import figure, rcParams
+        rcParams["text.usetex"] = False
+        picture = figure.Figure(figsize=(10, 3.6), layout="constrained")
+        for ax, keys in zip(picture.subplots(1, 2), (CURVE[3:5], CURVE[6:])):
+            for key, line in zip(keys, ("-", "--", "-.")):
+                ax.plot(columns["step"], columns[key], line, label=key.replace("_", " "))
+            ax.set(xlabel="gradient step", title=title)
+            ax.legend()
+        picture.axes[0].set(yscale="log", ylabel="KL divergence")
+        picture.axes[1].set(ylabel="rank correlation, held-out states")
+        with atomic_file(path) as file:
+            picture.savefig(file, dpi=110, format="png")
     except Exception as error:
         print(f"{path}: no picture: {' '.join(str(error).split())[:300]}", file=sys.stderr)
         return False
-
-
-def draw_curve(path, curve, title):
-    """Losses and rank correlations over the steps."""
-    columns = dict(zip(CURVE, np.array(curve).T))
-    figure, axes = pyplot().subplots(1, 2, figsize=(10, 3.6), layout="constrained")
-    for ax, lines in zip(axes, ({"kl_reward": "rewards", "kl_value": "values"}, {
-            "rank_correlation_h0": "Q, h = 0", "rank_correlation_last": "Q, h = H",
-            "rank_correlation_return": "return G"})):
-        for key, label in lines.items():
-            ax.plot(columns["step"], columns[key], label=label)
-        ax.set(xlabel="gradient step")
-        ax.legend()
-    axes[0].set(yscale="log", ylabel="KL divergence", title=title)
-    axes[1].set(ylim=(None, 1), ylabel="rank correlation", title="held-out states")
-    save_figure(path, figure)
+    return True
 
 
 def read_records(path):
@@ -2362,10 +2315,7 @@ def command_distill(args):
             Planner(*planned)  # what is missing, or too large, is missed now
         result, planning = distil_and_save(distiller, args, planning, header, out)
         obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
-        both = (expert, own), (distiller.student, planning)
-        result.update(evaluate_both(*both, path, args))
-        write_json(out / "result.json", result)  # if no more can be had, as timing needs processes
-        result.update(time_both(*both, obs))
+        result.update(compare((expert, own), (distiller.student, planning), obs, path, args))
         result.update(seconds_total=round(result["seconds_total"] + time.monotonic() - began, 1))
         write_json(out / "result.json", result)
     report(result, (own, planning))
@@ -2432,34 +2382,31 @@ def distil_and_save(distiller, args, planning, header, out):
             "kl_reward": curve[-1][3], "kl_value": curve[-1][4], "rank_correlation": q[0],
             "rank_correlation_by_step": q, "rank_correlation_returns": g, "played": played,
             **{name: getattr(planning, name) for name in CHOSEN}, "out": str(out),
-            "picture": drawn(draw_curve, out / "curve.png", curve,
-                             f"{args.task}, seed {args.seed}")}, planning
+            "picture": draw_curve(out / "curve.png", curve, f"{args.task}, seed {args.seed}")
+            }, planning
 
 
 COMPARED = {"expert": "the expert", "student": "the student", "policy": "its policy alone",
-            "same_search": "expert, searching like its student", "reflex": "its priors alone"}
+            "reflex": "its priors alone"}
 
 
 def compared(expert, student):
     """What distill compares, (model, planning) by COMPARED's keys: these two; the expert's policy
-    alone; if the student searches, its priors alone, and the expert searching around its policy
-    like it around these: what the model alone saves [D9]."""
+    alone; and, if the student searches, its priors alone."""
     (model, own), (learner, planning) = expert, student
     found = {"expert": expert, "student": student}
     if model.has_policy:
         found["policy"] = model, dataclasses.replace(own, prior="own", iterations=0)
     if planning.prior == "own" and planning.iterations:
         found["reflex"] = learner, dataclasses.replace(planning, iterations=0)
-        search = {name: getattr(planning, name) for name in SEARCH}
-        found["same_search"] = model, dataclasses.replace(own, **{**search, "pi_trajs": 0})
     return found
 
 
-def evaluate_both(expert, student, path, args):
-    """The returns of all that is `compared`, from the record beside the expert's file `path`, or
-    measured: result's part. expert, student: (model, planning), each over its own horizon."""
+def compare(expert, student, obs, path, args):
+    """Of all that is `compared` the returns, from the record beside the expert's file `path` or
+    measured, and the milliseconds of a decision in this process: result's part."""
     found = {"episodes": args.episodes, "eval_seed": args.eval_seed}
-    for name, (model, planning) in compared(expert, student).items():
+    for name, (model, planning) in (each := compared(expert, student)).items():
         returns, versions = recorded_returns(path, model, args.task, planning, args.eval_seed)
         recorded = len(returns) >= args.episodes and not args.evaluate_expert
         if not recorded:
@@ -2471,27 +2418,11 @@ def evaluate_both(expert, student, path, args):
                  "return_std": float(np.std(returns)), "horizon": planning.horizon,
                  "recorded": recorded, "versions": versions}
         found.update({f"{name}_{key}": value for key, value in about.items()})
-    return {**found, "kept": return_kept(found["student_return_mean"], found["expert_return_mean"])}
-
-
-def time_both(expert, student, obs):
-    """Milliseconds of a decision with all that is `compared`, in this process, and of the student
-    with a process on each core; where that costs more than it saves, or can't be (in a pool's
-    process, under a profiler), it counts as planning in one. For result."""
-    workers = useful_workers(student[0].config.num_agents)
-    with contextlib.ExitStack() as stack:
-        acts = {name: stack.enter_context(Planner(*planned)).act
-                for name, planned in compared(expert, student).items()}
-        with contextlib.suppress(UserError):
-            if workers:
-                acts["workers"] = stack.enter_context(Planner(*student, workers=workers)).act
-        seconds = interleaved_seconds([functools.partial(act, obs) for act in acts.values()], 20,
-                                      "timing")
-    ms = dict(zip(acts, (1e3 * np.median(seconds, 0)).tolist()))
-    alone, beside = ms.pop("student"), ms.pop("workers", np.inf)
-    return {**{f"plan_ms_{name}": value for name, value in ms.items()},
-            "plan_ms_student_in_process": alone, "plan_ms_student": (best := min(alone, beside)),
-            "speedup": ms["expert"] / best, "plan_workers": workers if best < alone else 0}
+    calls = [functools.partial(Planner(*of).act, obs) for of in each.values()]
+    ms = 1e3 * np.median(interleaved_seconds(calls, 20, "timing"), 0)
+    found.update({f"plan_ms_{name}": float(value) for name, value in zip(each, ms)})
+    return {**found, "speedup": found["plan_ms_expert"] / found["plan_ms_student"],
+            "kept": return_kept(found["student_return_mean"], found["expert_return_mean"])}
 
 
 def report(result, plannings):
@@ -2501,28 +2432,22 @@ def report(result, plannings):
     own, search = (f"{of.samples} x {of.iterations}" if of.iterations else "0" for of in plannings)
     print("\n{task}, {episodes} episodes, evaluation seed {eval_seed}, horizon {expert_horizon} "
           "and {student_horizon}\n".format_map(result))
-    expert, student = f"expert ({source}), one process", f"student, N = {result['num_agents']}"
-    rows = [("", "MPPI", "return", "ms a decision", "speed-up")]
-    for name, budget, who, timed in (
-            (f"{expert}, H = {result['expert_horizon']}", own, "expert", "expert"),
-            (COMPARED["policy"], "0", "policy", "policy"),
-            (COMPARED["same_search"], search, "same_search", "same_search"),
-            (f"{student}, its priors alone", "0", "reflex", "reflex"),
-            (f"{student}, one process, H = {result['student_horizon']}", search, "student",
-             "student_in_process"),
-            (f"student, workers beside: {result['plan_workers']}", "", "",
-             "student" if result["plan_workers"] else "nowhere")):
-        if ms := result.get(f"plan_ms_{timed}"):  # or it isn't `compared`
+    rows, student = [("", "MPPI", "return", "ms a decision", "speed-up")], (
+        f"student, N = {result['num_agents']}")
+    for who, name, budget in (("expert", f"expert ({source}), one process", own),
+                              ("policy", COMPARED["policy"], "0"),
+                              ("reflex", f"{student}, its priors alone", "0"),
+                              ("student", f"{student}, one process", search)):
+        if ms := result.get(f"plan_ms_{who}"):  # or it isn't `compared`
             rows.append((name, budget, f"{result[f'{who}_return_mean']:.0f} ± "
-                         f"{result[f'{who}_return_std']:.0f}" if who else "the same plans",
-                         f"{ms:.1f}", f"{result['plan_ms_expert'] / ms:.1f}"))
+                         f"{result[f'{who}_return_std']:.0f}", f"{ms:.1f}",
+                         f"{result['plan_ms_expert'] / ms:.1f}"))
     print_table(rows)
     if result["played"]:
         report_played(result)
-    q, g = (result[f"rank_correlation_{key}"] for key in ("by_step", "returns"))
     kept = "-" if result["kept"] is None else f"{result['kept']:.2f}"
-    print(f"\nreturn kept {kept}, rank correlation of Q {q[0]:.3f} (h = 0) to {q[-1]:.3f} (h = "
-          f"{len(q) - 1}), of the return {g[-1]:.3f}; Algorithm 1 distilled in "
+    print(f"\nreturn kept {kept}, rank correlation of the return "
+          f"{result['rank_correlation_returns'][-1]:.3f}; Algorithm 1 distilled in "
           "{seconds:.0f} s, {seconds_total:.0f} s in all, {out}/".format_map(result))
 
 

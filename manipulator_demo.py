@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))  # PYTHONSAFEPATH leaves it out
+sys.path[:0] = [str(Path(__file__).resolve().parent / folder) for folder in ("", "data")]
 import fac_tdmpc_ref as fac  # noqa: E402
 
 # the task of the authors' notebook
@@ -60,8 +60,7 @@ def inverse_kinematics(xy):
     """The authors' Jacobian-transpose descent: tip (..., 2, S) -> angles (..., 3, S).
 
     theta += gain J^T (xy - tip) from IK_START, until the tip is within IK_TOLERANCE. A sample that
-    is not there after IK_STEPS keeps the angles it has, as the authors' does.
-    """
+    is not there after IK_STEPS keeps the angles it has, as the authors' does."""
     goal_x, goal_y = np.split(xy, 2, axis=-2)  # (..., 1, S)
     theta = IK_START[:, None] + np.zeros_like(goal_x)
     for _ in range(IK_STEPS):
@@ -265,7 +264,8 @@ def cost(theta, goal):
 
 def draw_figure(path, runs, share):
     """Figure 11 for both planners, their rewards, and the map of goals; share from goal_map."""
-    figure, panels = fac.pyplot().subplots(2, 4, figsize=(14, 7.4), layout="constrained")
+    import plots
+    figure, panels = plots.pyplot().subplots(2, 4, figsize=(14, 7.4), layout="constrained")
     (*_, rewards), (*_, plane) = panels
     for row, key, color in zip(panels, ("centralized", "factored"), ("#b3541e", "#1f5fa8")):
         theta = np.stack(runs[key].theta, axis=1)
@@ -293,7 +293,7 @@ def draw_figure(path, runs, share):
     figure.colorbar(image, ax=plane, shrink=0.8)
     for axes in (panels[0, 0], panels[1, 0], plane):
         axes.plot(*GOAL, "*", color="#e0a800", markersize=16, markeredgecolor="black", zorder=5)
-    fac.save_figure(path, figure)
+    plots.save_figure(path, figure)
 
 
 def make_parser():
@@ -323,10 +323,9 @@ def planner_config(args):
         fac.need(least <= getattr(args, name) <= 10**8,
                  f"--{name} must be in {least} to 10**8, not {getattr(args, name)}")
     if args.figure:
-        fac.need(args.figure.endswith(".png") and not fac.Path(args.figure).is_dir(),
-                 f"--figure {args.figure} should end in .png, and not be a folder")
-        fac.check_writable(args.figure)  # UserError now rather than after the run
-        fac.pyplot()
+        with fac.optional("a clone of the repository", "plots"):
+            import plots
+        plots.pyplot_for(args.figure)  # UserError now rather than after the run
     return dataclasses.replace(TABLE_1, samples=args.samples, elites=min(5, args.samples),
                                horizon=args.horizon, discount=args.discount)
 
@@ -392,7 +391,8 @@ def command_demo(args):
     print_comparison(args, runs, result)
     print_appendix(result)
     if args.figure:
-        fac.drawn(draw_figure, args.figure, runs, goal_map(np.random.default_rng([args.seed, 2])))
+        import plots
+        plots.drawn(draw_figure, args.figure, runs, goal_map(np.random.default_rng([args.seed, 2])))
     settings = {k: v for k, v in vars(args).items() if k != "run"}
     return {**result, "settings": settings, "cores": fac.cores()}
 

@@ -5,13 +5,14 @@ from pathlib import Path
 
 sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
 import fac_tdmpc_ref as fac  # noqa: E402
+import plots  # noqa: E402
 
 EXPERT, STUDENT, PLAIN = "#f3d9c9", "#cfe3f1", "#eeeeee"
 
 
 def main():
     """Expert and student from left to right, and where Equation 4 compares them."""
-    plt = fac.pyplot()
+    plt = plots.pyplot()
     figure, ax = plt.subplots(figsize=(11, 4.1), layout="constrained")
     ax.set(xlim=(0, 110), ylim=(0, 41))
     ax.axis("off")
@@ -50,7 +51,7 @@ def main():
             "plan is the best of each.", va="center", fontsize=9)
     ax.set_title("An expert's world model is distilled into one small model for each joint",
                  fontsize=11)
-    fac.save_figure(fac.DATA / "figures" / "method.png", figure)
+    plots.save_figure(fac.DATA / "figures" / "method.png", figure)
 
 
 if __name__ == "__main__":

@@ -35,6 +35,7 @@ import numpy as np
 sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
 import fac_tdmpc_ref as fac  # noqa: E402
 import look  # noqa: E402
+import plots  # noqa: E402
 import speed  # noqa: E402
 import students  # noqa: E402
 from baselines import DecodingEnvironment, distiller_of  # noqa: E402
@@ -394,7 +395,7 @@ def time_students(path, tasks):
             theirs = planning_for(header, fac.preset_values(fac.PlannerConfig, preset))
             planning = planning_for(about, {"samples": samples, "iterations": iterations})
             obs = np.random.default_rng(0).standard_normal(student.config.dim_obs, fac.F32)
-            ms = fac.time_both((expert, theirs), (student, planning), obs)
+            ms = students.time_both((expert, theirs), (student, planning), obs)
             for row, found in own:
                 row["ranks"] = json.dumps({**found, **{
                     key: ms[key] for key in ms if key.startswith(students.MEASURED)}})
@@ -532,7 +533,7 @@ def time_runs(runs, opened, rounds):
             model, header = opened(run)
             planning = planning_for(header, json.loads(run["settings"]))
             obs = np.random.default_rng(0).standard_normal(model.config.dim_obs, fac.F32)
-            for count in {0, fac.useful_workers(model.config.num_agents)}:
+            for count in {0, speed.useful_workers(model.config.num_agents)}:
                 with contextlib.suppress(fac.UserError if count else ()):  # none can be started
                     act = stack.enter_context(fac.Planner(model, planning, workers=count)).act
                     calls.append((run["case"], run["seed"], count > 0, functools.partial(act, obs)))
@@ -830,7 +831,7 @@ def command_report(args):
     """report: every figure that has runs."""
     results, figures, result, text = Path(args.results), Path(args.figures), {}, []
     figures_from = os.path.relpath(figures, results)
-    fac.pyplot()
+    plots.pyplot()
     for name, make in REPORTS.items():
         if finished(read_rows(results / f"{name}.csv")):
             try:

@@ -5,6 +5,7 @@ import numpy as np
 
 import fac_tdmpc_ref as fac
 import look
+import plots
 
 WITHIN, BETWEEN = "walker, task by task", "walker and hopper"
 
@@ -63,7 +64,7 @@ def recognition(walker, hopper):
 def draw_latents(path, panels):
     """A panel for each {name: (points (n, 2), joints (n,), tasks (n,))}: colours for joints,
     markers for tasks."""
-    figure, axes = fac.pyplot().subplots(1, len(panels), figsize=(5.5 * len(panels), 4.8),
+    figure, axes = plots.pyplot().subplots(1, len(panels), figsize=(5.5 * len(panels), 4.8),
                                          layout="constrained", squeeze=False)
     for ax, (name, (points, joints, tasks)) in zip(axes[0], panels.items()):
         for k, task in enumerate(dict.fromkeys(tasks)):
@@ -72,7 +73,7 @@ def draw_latents(path, panels):
                            color=f"C{j}", marker="o^sD"[k % 4], label=f"{task}, joint {j}")
         ax.set(title=f"{name}: latents by t-SNE", xticks=[], yticks=[])
         ax.legend(fontsize=6, ncols=len(set(tasks)), loc="upper center", bbox_to_anchor=(0.5, 0))
-    fac.drawn(fac.save_figure, path, figure)
+    plots.drawn(plots.save_figure, path, figure)
 
 
 def compare(latents_of, tasks, points, seed, picture=None):

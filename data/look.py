@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import fac_tdmpc_ref as fac
+import plots
 
 PIXELS, BARS, TEXT = 240, 70, 34  # a picture's side, width of the bars beside, height of the text
 RENDERERS = "from dm_control import suite; suite.load('reacher', 'easy').physics.render(8, 8)"
@@ -84,7 +85,7 @@ def command_watch(args):
     fac.need(kind in (".gif", ".mp4") and not Path(args.out).is_dir(),
              f"{args.out}: expected the name of a .gif or .mp4 file")
     fac.check_writable(args.out)
-    fac.pyplot()  # brings Pillow
+    plots.pyplot()  # brings Pillow
     if kind == ".mp4":
         with fac.optional("imageio for .mp4", "experiments"):
             import imageio_ffmpeg  # noqa: F401
@@ -123,17 +124,9 @@ def command_watch(args):
 
 # ------------------------------------------------------------------- Figure 9 and agreement
 
-def pyplot_for(path):
-    """matplotlib.pyplot; UserError, before the work, if no picture can be written there."""
-    fac.need(Path(path).suffix == ".png" and not Path(path).is_dir(),
-             f"{path}: expected the name of a .png file")
-    fac.check_writable(path)
-    return fac.pyplot()
-
-
 def need_plots(path):
-    """`pyplot_for`; UserError, before the work, if scikit-learn is missing, too."""
-    plt = pyplot_for(path)
+    """`plots.pyplot_for`; UserError, before the work, if scikit-learn is missing, too."""
+    plt = plots.pyplot_for(path)
     with fac.optional("scikit-learn", "experiments"):
         import sklearn  # noqa: F401
     return plt
@@ -264,7 +257,7 @@ def command_figure9(args):
             if t in pictures:
                 ax.imshow(pictures[t])
                 ax.set_title(f"decision {t}")
-    fac.drawn(fac.save_figure, args.out, figure)
+    plots.drawn(plots.save_figure, args.out, figure)
     result = {"out": args.out, "task": task, "episodes": args.episodes, "silhouette": apart,
               "silhouette_shuffled": shuffled, "silhouette_untrained": first,
               "return_best": float(returns.max()), "return_worst": float(returns.min()),
@@ -328,7 +321,7 @@ def command_agreement(args):
              f"{args.model}: was distilled from another expert or replay; name them with --expert "
              "and --replay")
     fac.check_task(replay, task, f"{replay.path} (--replay)")
-    plt, rng = pyplot_for(args.out), np.random.default_rng(args.seed)
+    plt, rng = plots.pyplot_for(args.out), np.random.default_rng(args.seed)
     config = fac.PlannerConfig(**fac.made_for(header, args.model))
     about = {k: v for k, v in (header.get("distill") or {}).items() if k == "held_out"}
     share = fac.from_dict(fac.DistillConfig, about, args.model).held_out
@@ -353,7 +346,7 @@ def command_agreement(args):
     ax.set(xlabel="decision", ylabel="rank correlation with the expert's Q", ylim=(None, 1),
            title=f"{task}, the worst of {args.episodes} episodes: {rewards[worst].sum():.0f}")
     ax.legend(ncols=1 + len(own) // 8)
-    fac.drawn(fac.save_figure, args.out, figure)
+    plots.drawn(plots.save_figure, args.out, figure)
     result = {"out": args.out, "task": task, "held_out": known.mean(1).tolist(),
               "worst_episode": own.mean(1).tolist(), "when": when.tolist(),
               "return_worst": float(rewards[worst].sum()), "ceiling": ceiling,

@@ -11,7 +11,7 @@ import pickle
 import numpy as np
 
 import fac_tdmpc_ref as fac
-from look import pyplot_for
+import plots
 
 # robot: dim O, dim A (Figure 3), milliseconds of f_T, f_R, f_Q in TD-MPC and in Fac-TDMPC (Table 3)
 ROBOTS = {
@@ -48,6 +48,11 @@ class Predictor(fac.Workers):
         for name in FUNCTIONS[function]:
             self.model.forward(name, self._x)
         self.receive_all()
+
+
+def useful_workers(agents):
+    """As many processes beside this one as there are cores and agents for."""
+    return min(agents, fac.cores()) - 1
 
 
 def _prediction_worker(connection):
@@ -180,11 +185,11 @@ def command_table3(args):
     if args.command == "figure6":
         args.figure = args.figure or fac.DATA / "figures" / "figure6.png"
     if args.figure:
-        pyplot_for(args.figure)
+        plots.pyplot_for(args.figure)
     prediction, decision, hand_overs = [], [], []
     for robot in args.robots:
         agents = ROBOTS[robot][1]
-        workers = (fac.useful_workers(agents) if args.workers is None
+        workers = (useful_workers(agents) if args.workers is None
                    else min(args.workers, agents - 1))
         prediction += benchmark_prediction(robot, workers, args.runs)
         rows, hand_over = benchmark_decisions(robot, workers, planning, args.runs // 10)
@@ -196,7 +201,7 @@ def command_table3(args):
               "cores": fac.cores()}
     print_benchmark(result, args.robots)
     if args.figure:
-        fac.drawn(draw_prediction, args.figure, prediction, args.robots)
+        plots.drawn(draw_prediction, args.figure, prediction, args.robots)
     return result
 
 
@@ -233,7 +238,8 @@ def print_benchmark(result, robots):
 def draw_prediction(path, prediction, robots):
     """Figure 6: prediction times as bars, logarithmic."""
     subjects = list(dict.fromkeys((r["model"], r["mode"]) for r in prediction))
-    figure, axes = fac.pyplot().subplots(3, 1, figsize=(10, 8), layout="constrained", sharex=True)
+    figure, axes = plots.pyplot().subplots(3, 1, figsize=(10, 8), layout="constrained",
+                                           sharex=True)
     for ax, function in zip(axes, FUNCTIONS):
         for i, (model, mode) in enumerate(subjects):
             rows = [r for r in prediction if (r["function"], r["model"], r["mode"]) ==
@@ -244,7 +250,7 @@ def draw_prediction(path, prediction, robots):
         ax.grid(False, axis="x")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     axes[-1].set_xticks(range(len(robots)), [f"{r}\nN = {ROBOTS[r][1]}" for r in robots])
-    fac.save_figure(path, figure)
+    plots.save_figure(path, figure)
 
 
 def add_commands(commands):

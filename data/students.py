@@ -1,4 +1,8 @@
-"""Students as `distill` makes them, and their tables: `experiments.py students`."""
+"""Students as `distill` makes them, what argues about them, and their tables: `experiments.py
+students`."""
+import contextlib
+import dataclasses
+import functools
 import json
 import shutil
 from pathlib import Path
@@ -6,10 +10,11 @@ from pathlib import Path
 import numpy as np
 
 import fac_tdmpc_ref as fac
+from speed import useful_workers
 from tables import deviation, markdown, of_returns
 
 EVALUATION_SEEDS = (101, 102)  # which nothing was chosen by
-MEASURED = ("rank_correlation", "plan_ms", "same_search_returns",  # of result.json, in a row
+MEASURED = ("rank_correlation", "plan_ms", "same_search_returns",  # of a result, in a row
             "reflex_returns", "played", *fac.CHOSEN)
 KEPT, WINS = "kept, evaluation seeds 0 / 1", "planning wins, expert / student"
 FASTER = "speed-up, one core: over expert / the same search"
@@ -22,6 +27,53 @@ FLAGS = {"samples": "plan-samples", "iterations": "plan-iterations", "num_agents
 def folder(students, task, seed, preset):
     """Where `distill` leaves a student: TASK-SEED, its own default, or TASK-SEED-PRESET."""
     return Path(students) / "-".join([task, str(seed), *[preset][:preset != "default"]])
+
+
+def compared(expert, student):
+    """`fac.compared` and, if the student searches, the expert searching around its policy like it
+    around its priors: what the model alone saves [D9]."""
+    found, (model, own), (_, planning) = fac.compared(expert, student), expert, student
+    if planning.prior == "own" and planning.iterations:
+        search = {name: getattr(planning, name) for name in fac.SEARCH}
+        found["same_search"] = model, dataclasses.replace(own, **{**search, "pi_trajs": 0})
+    return found
+
+
+def time_both(expert, student, obs):
+    """Milliseconds of a decision with all that is `compared`, in this process, and of the student
+    with a process on each core; where that costs more than it saves, or can't be (in a pool's
+    process, under a profiler), it counts as planning in one."""
+    workers = useful_workers(student[0].config.num_agents)
+    with contextlib.ExitStack() as stack:
+        acts = {name: stack.enter_context(fac.Planner(*planned)).act
+                for name, planned in compared(expert, student).items()}
+        with contextlib.suppress(fac.UserError):
+            if workers:
+                acts["workers"] = stack.enter_context(fac.Planner(*student, workers=workers)).act
+        seconds = fac.interleaved_seconds(
+            [functools.partial(act, obs) for act in acts.values()], 20, "timing")
+    ms = dict(zip(acts, (1e3 * np.median(seconds, 0)).tolist()))
+    alone, beside = ms.pop("student"), ms.pop("workers", np.inf)
+    return {**{f"plan_ms_{name}": value for name, value in ms.items()},
+            "plan_ms_student_in_process": alone, "plan_ms_student": (best := min(alone, beside)),
+            "speedup": ms["expert"] / best, "plan_workers": workers if best < alone else 0}
+
+
+def argue(args):
+    """What `distill` of these arguments doesn't say of its student: the returns of the expert in
+    the same search, and `time_both`, for its result."""
+    expert, header, replay, path = fac.load_data(args)
+    student, about = fac.load_model(Path(args.out, "student.npz"), ["student"])
+    own = {**fac.preset_values(fac.PlannerConfig, args.preset), **fac.made_for(header, path)}
+    both = ((expert, fac.PlannerConfig(**own)),
+            (student, fac.PlannerConfig(**fac.made_for(about, args.out))))
+    found = time_both(*both, replay.observation[0].astype(fac.F32))
+    if same := compared(*both).get("same_search"):
+        model, planning = same
+        found["same_search_returns"] = fac.evaluate(
+            model, args.task, planning, args.episodes, args.eval_seed, args.workers,
+            "evaluating the expert, searching like its student")["returns"]
+    return found
 
 
 def distil_student(task, seed, preset, settings, students):
@@ -38,7 +90,7 @@ def distil_student(task, seed, preset, settings, students):
         args = fac.make_parser().parse_args([
             "distill", "--task", task, "--seed", str(seed), "--preset", preset, "--workers", "0",
             "--out", str(out), *flags, "--eval-seed", str(evaluation_seed)])
-        found = args.run(args)
+        found = {**args.run(args), **argue(args)}
         yield {"step": found["steps"], **of_returns(found["student_returns"], evaluation_seed),
                "expert_mean": found["expert_return_mean"], "rank_q": found["rank_correlation"],
                "rank_return": found["rank_correlation_returns"][-1],

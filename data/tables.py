@@ -9,6 +9,7 @@ import json
 import numpy as np
 
 import fac_tdmpc_ref as fac
+import plots
 
 
 def deviation(values):
@@ -50,7 +51,7 @@ def cell(found):
 def draw_lines(path, panels, xlabel, **axes):
     """A panel each {title: ({label: {x: [values]}}, level or None)}: mean and band (± sample
     deviation) over seeds; the level, an expert's, is a line across."""
-    plt = fac.pyplot()
+    plt = plots.pyplot()
     labels = list(dict.fromkeys(label for lines, _ in panels.values() for label in lines))
     cycle, columns = list(plt.rcParams["axes.prop_cycle"]), min(4, len(panels))
     alike, handles = len(labels) <= len(cycle), {}  # one style for a label in all panels?
@@ -85,7 +86,7 @@ def draw_lines(path, panels, xlabel, **axes):
     if alike:
         figure.legend(handles.values(), handles, loc="outside lower center", fontsize=8,
                       ncols=2 * columns)
-    fac.drawn(fac.save_figure, path, figure)
+    plots.drawn(plots.save_figure, path, figure)
 
 
 # -------------------------------------------------------------------- Figure 7: equal return
@@ -220,7 +221,7 @@ def kept_cell(found):
 def draw_bars(path, cells, kinds):
     """Bars of the return with each action dimension disturbed, {task: {case: {(kind, joint):
     [values]}}}; lines across: undisturbed, ("none", 0)."""
-    plt = fac.pyplot()
+    plt = plots.pyplot()
     figure, grid = plt.subplots(len(cells), len(kinds), squeeze=False, layout="constrained",
                                 figsize=(11, 2.8 * len(cells)), sharey="row")
     for row, (task, cases) in zip(grid, cells.items()):
@@ -237,4 +238,4 @@ def draw_bars(path, cells, kinds):
             ax.set(title=f"{task}: {what}", xlabel="action dimension", ylabel="episode return",
                    xticks=range(0, actions, 1 + actions // 20))
     figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    fac.drawn(fac.save_figure, path, figure)
+    plots.drawn(plots.save_figure, path, figure)

@@ -25,6 +25,7 @@ import numpy as np
 
 sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
 import fac_tdmpc_ref as fac  # noqa: E402
+import plots  # noqa: E402
 from numpy_learner import ExpertConfig, Learner, named, unnamed  # noqa: E402
 from tables import draw_lines  # noqa: E402
 
@@ -46,8 +47,16 @@ CURVE = ("decisions", "updates", "seconds", "exploration_std", "horizon", "retur
 
 def task_steps(task, config):
     """T: decisions in an episode of a task, at most, with the action repeat of a PlannerConfig."""
-    repeat = config.action_repeat
-    return fac.gym_sizes(task, repeat)[2] if fac.is_gym(task) else fac.episode_steps(repeat)
+    return episode_length(task, config.action_repeat)
+
+
+@functools.cache
+def episode_length(task, repeat):
+    """The same, of an action repeat."""
+    if not fac.is_gym(task):
+        return fac.episode_steps(repeat)
+    with contextlib.closing(fac.make_robot(task, repeat)) as robot:
+        return robot.episode_steps
 
 
 class Episode:
@@ -699,7 +708,7 @@ def export(training, out, result):
                        ("eval_student", "student")):
         points = {row["decisions"]: [row[key]] for row in training.curve if row[key] is not None}
         lines.update({label: points} if points else {})
-    fac.drawn(draw_lines, out / "curve.png", {f"{args.task}, seed {args.seed}": (lines, None)},
+    plots.drawn(draw_lines, out / "curve.png", {f"{args.task}, seed {args.seed}": (lines, None)},
               "decisions")
     print(f"\n{args.task}: {training.decisions:,} decisions, {result['updates']:,} updates, "
           f"{training.seconds / 60:.1f} minutes; {args.episodes} evaluation episodes\n")

@@ -208,15 +208,6 @@ def test_played_episodes_that_hold_anything_else_are_refused(replay, array, at, 
     assert part in str(caught.value)
 
 
-@pytest.mark.parametrize("obs, action", [
-    ((2, 11, 8), (2, 10, 3)), ((10, 8), (10, 3)), ((2, 10, 7), (2, 10, 3)),
-    ((2, 10, 3), (2, 10, 8)), ((2, 10, 8), (2, 10))])
-def test_played_episodes_of_other_shapes_are_refused(replay, obs, action):
-    with fresh(replay, CONFIG) as distiller, pytest.raises(fac.UserError) as caught:
-        distiller.add(np.zeros(obs), np.zeros(action))
-    assert str(caught.value).endswith(f", 3), found {obs} and {action}")
-
-
 def ramp():
     """An episode: step t's observation is t, its action t / 512, both of which float16 holds."""
     t = np.arange(fac.EPISODE_STEPS + 1.0)[:, None]
@@ -496,7 +487,7 @@ def test_part_one_is_at_most_700_lines_and_stands_alone():
     """It imports NumPy and four modules, and calls of Part II only what says so."""
     text = (fac.DATA.parent / "fac_tdmpc_ref.py").read_text()
     first, second = text.split("# ==== Part II")
-    assert first.count("\n") <= 700 and second.count("\n") <= 2021  # which may not grow
+    assert first.count("\n") <= 700 and second.count("\n") <= 1918  # which may not grow
     scope = {"__name__": "fac_tdmpc_ref"}
     exec(compile(first, "part one", "exec", dont_inherit=True), scope, scope)
     used = {node.id for node in ast.walk(ast.parse(first))

@@ -354,14 +354,15 @@ def test_an_environment_refuses_what_is_no_action(action, part):
 def test_actions_are_scaled_to_the_action_spec(monkeypatch):
     from dm_control import suite
     low, high, received = np.array([-2.0, 0, 1, 5]), np.array([3.0, 10, 2, 7]), []
-    spec = SimpleNamespace(minimum=low, maximum=high)
+    spec = SimpleNamespace(minimum=low, maximum=high, shape=(4,))
 
     def step(control):
         received.append(control)
         return SimpleNamespace(observation={"position": np.zeros(15)}, reward=0.0)
 
     monkeypatch.setattr(suite, "load", lambda *_, **__: SimpleNamespace(
-        action_spec=lambda: spec, step=step, close=None))
+        action_spec=lambda: spec, step=step, close=None, reset=lambda: None, _step_limit=1000,
+        observation_spec=lambda: {"position": SimpleNamespace(shape=(15,))}))
     env = fac.Environment("hopper-hop")
     for action, expected in ((-1, low), (1, high), (0, (low + high) / 2)):
         received.clear()
@@ -446,7 +447,7 @@ def test_a_mujoco_of_another_version_is_explained(monkeypatch):
         "wrapper"].mjbindings.sizes.array_sizes["mjmodel"]
     monkeypatch.setitem(sizes, "of_another_version", ("nv",))
     for make in (lambda: fac.Environment("reacher-hard"), lambda: fac.Environment("walker-walk"),
-                 lambda: fac.suite_sizes.__wrapped__("cartpole-swingup")):
+                 lambda: fac.robot_sizes.__wrapped__("cartpole-swingup")):
         with pytest.raises(fac.UserError, match="of_another_version.*mujoco==3.17.0 beside dm-con"):
             make()
 

@@ -18,6 +18,7 @@ import baselines
 import experiments
 import fac_tdmpc_ref as fac
 import look
+import plots
 import speed
 import students
 import tables
@@ -859,7 +860,7 @@ def test_a_seed_that_lacks_runs_is_left_out(tmp_path, capsys):
 def test_negative_returns_are_drawn(tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
     drawn = []
-    monkeypatch.setattr(fac, "save_figure", lambda path, figure: drawn.extend(figure.axes))
+    monkeypatch.setattr(plots, "save_figure", lambda path, figure: drawn.extend(figure.axes))
     for values in ([-1200.0, -250.0], [0.0, 900.0]):
         points = {step: [value] for step, value in enumerate(values)}
         tables.draw_lines(tmp_path / "x.png", {"a robot": ({"TAP": points}, None)}, "step")
@@ -982,7 +983,7 @@ def test_an_interval_is_as_wide_as_episodes_and_joints_scatter():
 def test_bands_over_seeds_are_sample_deviations(monkeypatch, tmp_path):
     pytest.importorskip("matplotlib")
     kept = []
-    monkeypatch.setattr(fac, "save_figure", lambda path, figure: kept.append(figure))
+    monkeypatch.setattr(plots, "save_figure", lambda path, figure: kept.append(figure))
     tables.draw_lines(tmp_path / "x.png", {"task": ({"case": {1: [3.0, 5.0], 2: [7.0]}}, None)},
                       "step")
     (band,) = kept[0].axes[0].collections
@@ -1169,7 +1170,7 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
     monkeypatch.setattr(fac, "recorded_returns", lambda *_: ([], ""))  # are of whole episodes
     monkeypatch.setattr(fac, "choose_by_playing", lambda distiller, task, taught, plannings, *_: (
         plannings[-2], []))  # narrow
-    monkeypatch.setattr(fac, "time_both", lambda *_: {
+    monkeypatch.setattr(students, "time_both", lambda *_: {
         "plan_workers": 0, **{f"plan_ms_{who}": 1.0 for who in (
             "expert", "policy", "same_search", "student_in_process", "student")}})
     monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: (rows.extend(
@@ -1223,7 +1224,7 @@ def test_milliseconds_of_students_are_measured_anew_for_each_preset_and_budget(t
         return {"plan_ms_expert": 30.0, "plan_ms_student": float(len(timed)), "speedup": 3.0,
                 "plan_ms_student_in_process": 7.0}
 
-    monkeypatch.setattr(fac, "time_both", time_both)
+    monkeypatch.setattr(students, "time_both", time_both)
     experiments.time_students(path, ["walker-run"])
     assert timed == [[(1, 128, 4, "last"), (6, 32, 3, "own")],
                      [(1, 512, 6, "last"), (6, 512, 6, "last")],

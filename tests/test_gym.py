@@ -142,7 +142,7 @@ def test_no_record_speaks_for_a_robot_that_may_be_another_by_now(tmp_path, monke
     measured = [fallen(seed) for seed in fac.episode_seeds(0, 2)]
     args = fac.make_parser().parse_args(["distill", "--task", WALK, "--episodes", "2",
                                          "--workers", "0"])
-    found = fac.evaluate_both((model, config), (model, config), path, args)
+    found = fac.compare((model, config), (model, config), np.zeros(3), path, args)
     assert (found["expert_returns"], found["expert_recorded"]) == (measured, False)
     header = {"kind": "expert", "task": WALK, "planner": {"samples": 2}}
     assert multitask.teacher_returns(model, header, path, 2, 0) == measured

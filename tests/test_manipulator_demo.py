@@ -547,7 +547,7 @@ def test_import_and_help_are_light():
     (["--seed", "-1"], "--seed must be in 0 to"),
     (["--steps", "many"], "invalid int value"),
     (["--ik", "guess"], "invalid choice"),
-    (["--figure", "arm.jpg"], "should end in .png"),
+    (["--figure", "arm.jpg"], "expected the name of a .png file"),
     (["--colour", "red"], "unrecognized arguments"),
     (["--horizon", "100000000", "--steps", "1"], "horizon must be at least 0 and at most 499"),
 ])

@@ -797,9 +797,10 @@ def test_without_a_seed_every_planner_is_another():
 
 
 def test_cores_are_those_this_process_may_use(monkeypatch):
+    from speed import useful_workers
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 5, 7}, raising=False)
-    assert fac.cores() == 3 and fac.useful_workers(6) == 2 and fac.useful_workers(2) == 1
+    assert fac.cores() == 3 and useful_workers(6) == 2 and useful_workers(2) == 1
     monkeypatch.delattr(os, "sched_getaffinity")
     assert fac.cores() == 64
 
