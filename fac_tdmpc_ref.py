@@ -8,7 +8,7 @@ action dimension. Each joint then plans alone: cheaper, and in parallel.
 
 Part I is the method, to be read from top to bottom: 1 settings, 2 layers, 3 world model, 4
 distillation (Equation 4, Algorithm 1), 5 planning (Equations 2 and 3). It runs (`distill --plain`).
-Part II adds [D8], [D9] and `reuse` [D1], each with its settings, speed and the engineering.
+Part II adds [D8], credit and what teaches priors [D9], `reuse` [D1], speed and the engineering.
 Experts learn, by Equation 1, in data/ [D6]. The README lists the departures, [D1] to [D9].
 
 The one idea that keeps it small: every model carries an agent axis N, and a centralized model is
@@ -89,7 +89,7 @@ class ModelConfig(Settings):
 class PlannerConfig(Settings):
     """MPPI. A model's file may name others. Raises UserError for values that can't plan."""
     samples: int = field(128, "S: sequences drawn at once [D5]", paper=512, least=1, most=10 ** 6)
-    iterations: int = field(4, "of MPPI [D5]; 0: its first mean acts", paper=6, least=0)
+    iterations: int = field(4, "of MPPI [D5]; 0: the priors act", paper=6, least=0)
     prior: str = field("last", "first mean: the last plan's, moved on, or what each agent's own "
                        "prior (an expert's: its policy) would do [D9]",
                        repr=False, choices=("last", "own"))
@@ -308,7 +308,7 @@ class WorldModel:
     `params` maps TD-MPC's state-dict names to arrays with a leading agent axis, of one dtype
     (float32; float64 to check gradients). The encoder is centralized; only experts have TD-MPC's
     policy, `_pi`, and only students a prior for each agent, `_prior` [D9]. A student keeps of its
-    expert the encoder alone, frozen, whose latent its own encoders read [D3]."""
+    expert at most the encoder, frozen, whose latent its own encoders read [D3]."""
 
     def __init__(self, config, params):
         self.config, self.params = config, params
@@ -380,7 +380,7 @@ class WorldModel:
 
     def prior(self, latents, steps):
         """What each agent would do without a search: `latents` -> actions (N, steps, d, B), by its
-        P^i, which names `prior_steps` of them [D9]; an expert: its policy, rolled out."""
+        P^i, `prior_steps` of them, then the last again [D9]; an expert: its policy, rolled out."""
         if self.has_policy:
             return policy_rollout(self, latents, [F32(0)] * steps).swapaxes(0, 1)
         sizes = self.config
@@ -601,7 +601,7 @@ def h_step_return(model, z, actions, config):
 
 
 def mppi(returns, mean, config, rngs, proposals=None):
-    """MPPI: refine a Gaussian over action sequences by its elites, for each agent alone.
+    """MPPI: refine a Gaussian over action sequences by its elites, an agent alone, once or more.
 
     returns: actions (N, L, d, S) -> every G_i (N, S); mean (N, L, d): the first Gaussian's; rngs:
     one Generator for each agent; proposals (N, L, d, P): sequences that compete in every iteration.
@@ -671,7 +671,8 @@ class AgentPlanner:
 
     def plan(self, latents):
         """`WorldModel.latents` (N, ., 1) -> actions (N, L, d), the first of which acts: a search
-        that begins from the agents' own priors [D9], or from the last mean, moved on."""
+        that begins from the agents' own priors [D9], which act without one (L = 1), or from the
+        last mean, moved on."""
         first = self.mean
         if self.config.prior == "own":
             first = self.model.prior(latents, self.mean.shape[1])[..., 0]
@@ -817,6 +818,7 @@ def rules_together(config):
         yield "horizon", config.horizon < T, f"below {T}, an episode's decisions"
         yield "elites", config.elites <= config.samples, f"at most samples ({config.samples})"
         yield "min_std", config.min_std <= config.max_std, f"at most max_std ({config.max_std})"
+        yield "iterations", config.iterations or config.prior == "own", "above 0 without a prior"
     elif isinstance(config, DistillConfig):
         yield ("played_share", config.played_share or not config.expert_episodes,
                "above 0 where there are expert_episodes")
@@ -844,7 +846,8 @@ class DistillConfig(Algorithm1Config):
     policy_share: float = field(0.5, "share of states where the policy's actions are perturbed, "
                                 "not those done [D8]", paper=0.0, plain=0.0, least=0, most=1)
     reuse: int = field(4, "steps that learn from a state's perturbations [D1]", paper=1, least=1)
-    expert_episodes: int = field(96, "that its policy plays first [D8]", paper=0, plain=0, least=0)
+    expert_episodes: int = field(96, "that its policy plays first [D8]; priors a quarter "
+                                 "a round, a sixth to choose [D9]", paper=0, plain=0, least=0)
     played_share: float = field(0.5, "share of states that are from these episodes [D8]",
                                 paper=0.0, plain=0.0, least=0, most=1)
     priors: bool = field(True, "each agent learns a prior of its own behind Algorithm 1 [D9]",
@@ -1364,7 +1367,7 @@ def checked(values, shape, what, dtype=F32):
 
 
 class Planner(contextlib.ExitStack):  # whose `close` ends the workers
-    """Observation in, action out; an episode's next plan starts from the last one's mean.
+    """Observation in, action out; a plan starts from priors, or from an episode's last mean.
 
         with Planner(model, PlannerConfig(), seed=0, workers=1) as planner:
             action = planner.act(obs)      # (O,) -> (A,) in [-1, 1]
@@ -1381,8 +1384,7 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
              "the model has no prior for plans to begin from: it is a student distilled without, "
              "or an expert without a policy; pass --plan-prior last (evaluate: --prior last)")
         self._parts = split_agents(model.config.num_agents, workers)
-        own, *others = ((some_agents(model, part.start, part.stop), config)
-                        for part in self._parts)
+        own, *others = ((some_agents(model, part.start, part.stop), config) for part in self._parts)
         self.own = FastPlanner(*own)
         super().__init__()
         self._workers = self.enter_context(Workers(_planning_worker, workers, "planning worker"))
@@ -2235,13 +2237,13 @@ def draw_curve(path, curve, title):
             from matplotlib import figure, rcParams
         rcParams["text.usetex"] = False
         picture = figure.Figure(figsize=(10, 3.6), layout="constrained")
-        for ax, keys in zip(picture.subplots(1, 2), (CURVE[3:5], CURVE[6:])):
+        for ax, keys, label in zip(picture.subplots(1, 2), (CURVE[3:5], CURVE[6:]), (
+                "KL divergence", "rank correlation, held-out states")):
             for key, line in zip(keys, ("-", "--", "-.")):
                 ax.plot(columns["step"], columns[key], line, label=key.replace("_", " "))
-            ax.set(xlabel="gradient step", title=title)
+            ax.set(xlabel="gradient step", ylabel=label, title=title)
             ax.legend()
-        picture.axes[0].set(yscale="log", ylabel="KL divergence")
-        picture.axes[1].set(ylabel="rank correlation, held-out states")
+        picture.axes[0].set_yscale("log")
         with atomic_file(path) as file:
             picture.savefig(file, dpi=110, format="png")
     except Exception as error:
@@ -2363,7 +2365,9 @@ def distil_and_save(distiller, args, planning, header, out):
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
     curve, seconds, before = train_student(distiller, out, settings, planning, args.workers)
     q, g = (ranks.tolist() for ranks in distiller.ranks(256, planning.discount))
-    if finished:
+    need(finished or not config.priors or planning.prior == "own", "--plan-prior last: expected "
+         "--no-priors, or a run whose search is chosen: give the command without it first")
+    if finished:  # whose file stays as it is, whatever flags say of today's planning
         own, played = made_for(finished, path), finished.get("played", [])
         if planning.prior == own.get("prior") == "own":
             planning = planned(**{name: own[name] for name in CHOSEN if name in own})
@@ -2373,9 +2377,10 @@ def distil_and_save(distiller, args, planning, header, out):
             planning, played = choose_by_playing(
                 distiller, args.task, taught, [*dict.fromkeys(
                     planned(**search) for search in SEARCHES)], args.workers)
-    save_model(out / "student.npz", student, {
-        "kind": "student", **settings, "training": header.get("training", {}),
-        "planner": {name: getattr(planning, name) for name in SEARCH}, "played": played})
+    if not finished:
+        save_model(path, student, {
+            "kind": "student", **settings, "training": header.get("training", {}),
+            "planner": {name: getattr(planning, name) for name in SEARCH}, "played": played})
     write_json(out / "config.json", {**settings, "planner": vars(planning)})
     return {"task": args.task, "seed": args.seed, "num_agents": student.config.num_agents,
             "steps": config.steps, "seconds": round(seconds, 1), "seconds_total": before,
@@ -2555,7 +2560,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def make_parser():
-    """The command line, generated from the configs of section 1."""
+    """The command line, generated from the configs."""
     parser = Parser(prog="fac_tdmpc_ref.py", description="Fac-TDMPC in NumPy: distil a TD-MPC "
                     "expert into one small world model for each joint, and plan with them.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")

@@ -258,7 +258,8 @@ def measure(model, task, planning, count, environment=None):
 
 def distil(task, seed, case, settings):
     """Distil a student; a row at each evaluation. settings: of DistillConfig, and `num_agents`,
-    `evaluations` on the way, of so many `episodes`, planned with `samples` and `iterations`."""
+    `evaluations` on the way, of so many `episodes`, planned with `samples` and `iterations` around
+    priors that know its plans: no search is chosen here."""
     own = {k: settings.pop(k, v) for k, v in (("num_agents", None), ("evaluations", 1),
                                               ("episodes", 10))}
     about = {k: settings.pop(k) for k in ("samples", "iterations") if k in settings}
@@ -269,6 +270,7 @@ def distil(task, seed, case, settings):
     planning = planning_for(header, {**fac.student_planning(config), **about,
                                      "horizon": config.horizon})
     student, environment = distiller.student, None
+    fresh = fac.prior_weights(student)
     if case == "TAP":  # whose actions are others, which the expert's policy doesn't know
         environment = DecodingEnvironment(task, expert, distiller.vae, planning.action_repeat)
         planning = dataclasses.replace(planning, prior="last", max_std=2.0)
@@ -279,7 +281,8 @@ def distil(task, seed, case, settings):
         for _ in distiller.run():
             if distiller.t % every and distiller.t < config.steps:
                 continue
-            if planning.prior == "own":
+            if planning.prior == "own":  # anew, however many evaluations there are
+                student.params.update({key: v.copy() for key, v in fresh.items()})
                 fac.teach_priors(distiller, task, planning, 0)
             row = measure(student, task, planning, own["episodes"], environment)
             if not environment:  # others' ranks are of the robot's actions
@@ -907,9 +910,9 @@ def make_parser():
         sub = add_runs(name, run, help, walkers, episodes=episodes)
         sub.add_argument("--students", default="runs", help="where distill left TASK-SEED/ [runs]")
     sub = add_runs("students", command_students, "Students as distill makes them by default, for "
-                   "the README's main table: evaluation seeds 0 and 1, and the expert's policy "
-                   "alone; then, where any is new, milliseconds of all these tasks' (keep the "
-                   "machine quiet for these).", shipped, episodes=20)
+                   "the README's main table: evaluation seeds 101 and 102, and the expert's "
+                   "policy alone; then, where any is new, milliseconds of all these tasks' (keep "
+                   "the machine quiet for these).", shipped, episodes=20)
     sub.add_argument("--students", default="runs", help="leave them in TASK-SEED/ there [runs]")
     sub.add_argument("--preset", choices=("default", "plain", "paper"), default="default",
                      help="distill's: a column of the table for each [default]")

@@ -35,7 +35,8 @@ def shares(model, latents, config):
                                 config=config)
     nothing = np.zeros((n, config.horizon + 1, model.config.agent_actions), fac.F32)
     first = model.prior(latents, config.horizon + 1)[..., 0] if config.prior == "own" else nothing
-    plan, _, _ = fac.mppi(returns, first, config, [np.random.default_rng(0) for _ in range(n)])
+    rngs = [np.random.default_rng(0) for _ in range(n)]
+    plan = fac.mppi(returns, first, config, rngs)[0] if config.iterations else first
     worth = returns(np.stack([plan, nothing], -1))
     return worth[:, 0] - worth[:, 1]
 

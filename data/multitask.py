@@ -413,7 +413,8 @@ def make_parser():
         else:
             sub.add_argument("--steps", type=int, dest="DistillConfig.steps", metavar="INT", help=
                              f"gradient steps in all [{fac.DistillConfig.steps} for each task]")
-            fac.add_config(sub, fac.DistillConfig, skip=("steps", "targets", "encoder_input"))
+            fac.add_config(sub, fac.DistillConfig, skip=(
+                "steps", "targets", "encoder_input", "priors"))
         sub.add_argument("--data", help="folder with TASK/expert.npz and replay.npz [data]")
         return sub.add_argument
 

@@ -51,7 +51,8 @@ class Multitask(fac.WorldModel):
         k, (dim_obs, dim_action) = [*self.dims].index(task), self.dims[task]
         n = min(self.config.num_agents, dim_action)
         sizes = dataclasses.replace(self.config, dim_obs=dim_obs, dim_action=dim_action,
-                                    num_agents=n, prior_steps=int(teacher is not None))
+                                    num_agents=n,
+                                    prior_steps=int(bool(teacher and teacher.has_policy)))
         params = {key: value[:n] for key, value in self.params.items()}
         embedding, scale = (params.pop(key)[:, :, k] for key in (TASKS, SCALES))
         for name in ("_dynamics", "_reward", "_Q1", "_Q2"):  # no columns for actions it lacks

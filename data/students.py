@@ -16,7 +16,7 @@ from tables import deviation, markdown, of_returns
 EVALUATION_SEEDS = (101, 102)  # which nothing was chosen by
 MEASURED = ("rank_correlation", "plan_ms", "same_search_returns",  # of a result, in a row
             "reflex_returns", "played", *fac.CHOSEN)
-KEPT, WINS = "kept, evaluation seeds 0 / 1", "planning wins, expert / student"
+KEPT, WINS = "kept by evaluation seed", "planning wins, expert / student"
 FASTER = "speed-up, one core: over expert / the same search"
 HEADS = ("seeds", "MPPI", "student", KEPT, "least kept", WINS,
          "the same search with the expert: kept", FASTER,
@@ -125,11 +125,16 @@ def kept(rows, key="returns"):
 def wins(rows, key="returns", over="policy_returns"):
     """What returns are above others in the same episodes: mean ± standard error over episodes and
     over students, as if these were apart. rows: {evaluation seed: rows by seed}"""
+    return "{:.0f} ± {:.0f}".format(*difference(rows, key, over))
+
+
+def difference(rows, key="returns", over="policy_returns"):
+    """`wins`, its mean and its error."""
     found = np.concatenate([
         [np.subtract(returns(row, key), returns(row, over)) for row in rows[seed]]
         for seed in sorted(rows)], 1)  # (students, episodes)
     errors = [x.std(ddof=1) / len(x) ** 0.5 for x in (found.mean(0), found.mean(1)) if len(x) > 1]
-    return f"{found.mean():.0f} ± {np.hypot.reduce(errors):.0f}"
+    return found.mean(), np.hypot.reduce(errors)
 
 
 def measured(rows, of):
@@ -212,7 +217,7 @@ def alone_tables(lines):
     """What each joint wins alone: the README's table, and all of it. Mean returns over students and
     episodes of all evaluation seeds: the expert, its policy alone, the student's priors alone, the
     student with the search that it chose by playing (it may be none), the expert in the same
-    search; ± standard error over episodes of the student's difference from the expert's."""
+    search; ± `difference`'s error of the student's from the expert's."""
     short, whole = [], []
     for line, rows in lines.items():
         own = sum(rows.values(), [])
@@ -223,9 +228,7 @@ def alone_tables(lines):
                                                     returns(row, "policy_returns")))
         expert, policy, reflex, student, same = (f"{overall(own, key):.0f}" for key in (
             "expert_returns", "policy_returns", "reflex_returns", "returns", "same_returns"))
-        gap = np.concatenate([np.subtract(returns(row), returns(row, "expert_returns"))
-                              for row in own])
-        error = gap.std(ddof=1) / len(gap) ** 0.5
+        _, error = difference(rows, over="expert_returns")
         search = " / ".join(dict.fromkeys(
             "{samples} x {iterations}, {max_std}".format_map(of) if of["iterations"] else "none"
             for of in about))

@@ -1283,10 +1283,12 @@ def test_shares_are_each_agent_s_own():
     np.testing.assert_allclose(found, alone, rtol=1e-4)
 
 
-def test_shares_are_of_plans_that_start_as_the_model_s_do():
-    """Around its policy, with hardly any width: what the policy's rollout is worth."""
+@pytest.mark.parametrize("iterations", [0, 4])
+def test_shares_are_of_plans_that_start_as_the_model_s_do(iterations):
+    """Around its policy, with hardly any width or no search: what the policy's rollout is worth."""
     model, obs = random_model(1, policy=True), np.full((8, 1), 0.3, np.float32)
-    config = fac.PlannerConfig(prior="own", min_std=1e-6, max_std=1e-6, horizon=2)
+    config = fac.PlannerConfig(iterations=iterations, prior="own", min_std=1e-6, max_std=1e-6,
+                               horizon=2)
     plan, z = fac.policy_plan(model, obs, 3, model.config), model.encode(obs)
     worth = fac.h_step_return(model, z, np.concatenate([plan, 0 * plan], -1), config)[0]
     np.testing.assert_allclose(look.shares(model, model.latents(obs), config),
