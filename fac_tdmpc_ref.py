@@ -1605,8 +1605,8 @@ class Environment:
                 raise UserError(f"{task}: dm_control can't play it here ({error}); MUJOCO_GL=egl "
                                 "or osmesa may help") from None
             steps = self.env._step_limit  # it has no public name
-            need(steps == CONTROL_STEPS, f"{task}: has {steps} control steps; expected "
-                 f"{CONTROL_STEPS}")
+            need(task in TASKS or steps == CONTROL_STEPS, f"{task}: has {steps} control steps; "
+                 f"expected {CONTROL_STEPS}")
         self.dim_obs = sum(int(np.prod(s.shape)) for s in self.env.observation_spec().values())
         spec = self.env.action_spec()
         self.dim_action = spec.shape[0]
@@ -2360,13 +2360,13 @@ def distil_and_save(distiller, args, planning, header, out):
         model, finished = load_model(path, ["student"])
         same_settings({key: finished.get(key) for key in settings}, settings, path)
         student.params.update(prior_weights(model))
+    need(finished or not config.priors or planning.prior == "own", "--plan-prior last: expected "
+         "--no-priors, or a run whose search is chosen: give the command without it first")
     print(f"{args.task}: {student.config.num_agents} agents, {len(distiller.optimizer.vector):,} "
           f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
           f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
     curve, seconds, before = train_student(distiller, out, settings, planning, args.workers)
     q, g = (ranks.tolist() for ranks in distiller.ranks(256, planning.discount))
-    need(finished or not config.priors or planning.prior == "own", "--plan-prior last: expected "
-         "--no-priors, or a run whose search is chosen: give the command without it first")
     if finished:  # whose file stays as it is, whatever flags say of today's planning
         own, played = made_for(finished, path), finished.get("played", [])
         if planning.prior == own.get("prior") == "own":

@@ -59,14 +59,14 @@ def time_both(expert, student, obs):
             "speedup": ms["expert"] / best, "plan_workers": workers if best < alone else 0}
 
 
-def argue(args):
-    """What `distill` of these arguments doesn't say of its student: the returns of the expert in
-    the same search, and `time_both`, for its result."""
+def argue(args, chosen):
+    """What `distill` of these arguments doesn't say of its student, with the search `chosen`: the
+    returns of the expert in the same search, and `time_both`, for its result."""
     expert, header, replay, path = fac.load_data(args)
     student, about = fac.load_model(Path(args.out, "student.npz"), ["student"])
     own = {**fac.preset_values(fac.PlannerConfig, args.preset), **fac.made_for(header, path)}
     both = ((expert, fac.PlannerConfig(**own)),
-            (student, fac.PlannerConfig(**fac.made_for(about, args.out))))
+            (student, fac.PlannerConfig(**{**fac.made_for(about, args.out), **chosen})))
     found = time_both(*both, replay.observation[0].astype(fac.F32))
     if same := compared(*both).get("same_search"):
         model, planning = same
@@ -82,7 +82,7 @@ def distil_student(task, seed, preset, settings, students):
     flags = [f"--{FLAGS.get(name, name)}={value}" for name, value in settings.items()]
     out = default = folder(students, task, seed, preset)
     if budget := [f"{k}-{settings[k]}" for k in ("samples", "iterations") if k in settings]:
-        out = default.with_name("-".join([default.name, *budget]))  # its file names its search
+        out = default.with_name("-".join([default.name, *budget]))  # whose search is another
         if default.exists() and not out.exists():
             shutil.copytree(default, part := out.with_name(f"{out.name}.tmp"), dirs_exist_ok=True)
             part.rename(out)  # whole, or not there
@@ -90,7 +90,8 @@ def distil_student(task, seed, preset, settings, students):
         args = fac.make_parser().parse_args([
             "distill", "--task", task, "--seed", str(seed), "--preset", preset, "--workers", "0",
             "--out", str(out), *flags, "--eval-seed", str(evaluation_seed)])
-        found = {**args.run(args), **argue(args)}
+        found = args.run(args)
+        found.update(argue(args, {name: found[name] for name in fac.CHOSEN}))
         yield {"step": found["steps"], **of_returns(found["student_returns"], evaluation_seed),
                "expert_mean": found["expert_return_mean"], "rank_q": found["rank_correlation"],
                "rank_return": found["rank_correlation_returns"][-1],

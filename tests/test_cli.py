@@ -486,17 +486,21 @@ def test_searches_that_flags_leave_are_tried_cheapest_first(quick, flags, tried)
     assert result["played"] == header["played"] and len(result["played"]) == 1
 
 
-@pytest.mark.parametrize("flags, priors", [
-    (["--no-priors"], False), (["--preset", "plain", "--expert-episodes", "0"], False),
-    (["--plan-prior", "last"], True)])
-def test_students_that_do_not_begin_from_priors_plan_from_the_last_plan(quick, flags, priors):
-    """Nothing is chosen by playing; what has no priors learns none."""
-    result, student, header, tried, evaluated = quick(*flags, taught=0.5 if priors else None)
-    assert tried == [] == result["played"] and student.config.prior_steps == 2 * priors
+@pytest.mark.parametrize("flags", [
+    ["--no-priors"], ["--preset", "plain", "--expert-episodes", "0"]])
+def test_students_without_priors_plan_from_the_last_plan(quick, flags):
+    """Nothing is chosen by playing, and no prior learned."""
+    result, student, header, tried, evaluated = quick(*flags, taught=None)
+    assert tried == [] == result["played"] and student.config.prior_steps == 0
     ((learner, planning),) = evaluated
     assert planning == fac.PlannerConfig(horizon=1) and header["planner"]["prior"] == "last"
     assert planning == fac.PlannerConfig(**fac.made_for(header, "student"))
-    assert bool(fac.prior_weights(student)) == priors == bool(fac.prior_weights(learner))
+    assert not fac.prior_weights(student) and not fac.prior_weights(learner)
+
+
+def test_a_first_run_with_priors_plans_around_them(quick):
+    with pytest.raises(AssertionError, match="--plan-prior last: expected --no-priors"):
+        quick("--plan-prior", "last")
 
 
 def test_a_finished_run_given_again_reads_its_priors_and_its_choice(quick, tmp_path):
@@ -514,6 +518,7 @@ def test_a_finished_run_given_again_reads_its_priors_and_its_choice(quick, tmp_p
     assert [getattr(planning, name) for name in fac.CHOSEN] == [0.5, 16, 2]
     ((_, planning),) = quick("--plan-prior", "last", taught=None)[4]
     assert planning == fac.PlannerConfig(horizon=1)
+    assert (tmp_path / "out" / "student.npz").read_bytes() == written  # as it was chosen
 
 
 def test_evaluate_plans_a_student_as_it_was_chosen(quick, tmp_path, monkeypatch):

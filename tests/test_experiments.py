@@ -1101,7 +1101,7 @@ def test_the_table_of_students_has_a_line_for_each_preset_and_each_chosen_budget
     assert own[students.FASTER] == "4.5 / 2.5"
     assert own["the same search with the expert: kept"] == "0.92"  # 115 of 125
     assert (own["seeds"], own["minutes"]) == ("2", "6")
-    assert own["kept, evaluation seeds 0 / 1"] == "0.70 / 0.90"
+    assert own[students.KEPT] == "0.70 / 0.90"
     assert own["least kept"] == "0.60"  # of each seed's two: 0.80, 0.60; 1.00, 0.80
     # 110, -60 twice; each episode's mean over the two seeds: 70, -95, 135, -110, an error of 60.7;
     # each seed's over the episodes: 12.5, -12.5, one of 12.5
@@ -1109,7 +1109,7 @@ def test_the_table_of_students_has_a_line_for_each_preset_and_each_chosen_budget
     assert own["rank correlation of G, H = 0 / last"] == "0.90 / 0.50"
     assert own["authors' logs: 100% TD-MPC / Fac-TDMPC"] == "836 / 809"
     assert (paper["task"], paper["seeds"], paper["MPPI"]) == ("walker-run, paper", "1", "512 x 6")
-    assert paper["kept, evaluation seeds 0 / 1"] == "0.40 / 0.32"
+    assert paper[students.KEPT] == "0.40 / 0.32"
     assert paper[students.FASTER] == "4.5"
     assert paper["the same search with the expert: kept"] == "-"
     assert chosen["task"] == "walker-run, samples 512, iterations 6"
@@ -1191,7 +1191,8 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
                                    "student.npz")
     assert (header["seed"], model.config.num_agents, header["distill"]["steps"]) == (3, 3, 1)
     expert, _ = fac.load_model(fac.data_file("reacher-easy", "expert.npz"))
-    own, students_own = (fac.PlannerConfig(**of) for of in ({}, fac.made_for(header, "")))
+    own, students_own = (fac.PlannerConfig(**of) for of in ({}, {
+        **fac.made_for(header, ""), "samples": 4, "iterations": 1}))
     for row in rows[2:]:
         seeds = fac.episode_seeds(int(row["evaluation_seed"]), 1)
         for found, who, planning in (

@@ -322,7 +322,8 @@ def test_a_plan_of_no_iterations_is_what_the_prior_would_do(monkeypatch):
             assert plan.shape == (model.config.num_agents, 1, model.config.agent_actions)
             assert np.array_equal(plan.ravel(), action)
             np.testing.assert_allclose(action, expected, atol=1e-5)
-        assert not fac.Planner(model, fac.PlannerConfig(iterations=0)).act(obs).any()
+    with pytest.raises(fac.UserError, match="iterations must be above 0 without a prior"):
+        fac.Planner(model, fac.PlannerConfig(iterations=0))
 
 
 @pytest.mark.parametrize("agents", [1, 3])
