@@ -2229,8 +2229,7 @@ def optional(library, extra):
 
 
 def draw_curve(path, curve, title):
-    """Losses and rank correlations over the steps, as a picture; whether it could be made: what
-    goes wrong is said, and costs nothing else."""
+    """The learning curve's picture; whether it could be made: what goes wrong costs no result."""
     columns = dict(zip(CURVE, np.array(curve).T))
     try:
         with optional("matplotlib", "plots"):
@@ -2460,8 +2459,9 @@ def report_played(result):
     """Print what `choose_by_playing` saw: returns, and by what each is below the best one."""
     played = result["played"]
     best = np.array(max((of["returns"] for of in played), key=np.mean))
+    search = "{samples} x {iterations}, deviation {max_std}" if result["iterations"] else "no search"
     print(f"\nchosen by playing {len(best)} episodes of the run's own seeds (below the best ± "
-          "standard error): {samples} x {iterations}, deviation {max_std}\n".format_map(result))
+          f"standard error): {search.format_map(result)}\n")
     rows = [("priors taught", "MPPI", "first deviation", "return", "below the best")]
     for of in played:
         behind = best - np.array(of["returns"])
