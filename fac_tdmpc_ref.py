@@ -2459,7 +2459,7 @@ def report_played(result):
     """Print what `choose_by_playing` saw: returns, and by what each is below the best one."""
     played = result["played"]
     best = np.array(max((of["returns"] for of in played), key=np.mean))
-    search = "{samples} x {iterations}, deviation {max_std}" if result["iterations"] else "no search"
+    search = "{samples} x {iterations}, deviation {max_std}" if result["iterations"] else "none"
     print(f"\nchosen by playing {len(best)} episodes of the run's own seeds (below the best ± "
           f"standard error): {search.format_map(result)}\n")
     rows = [("priors taught", "MPPI", "first deviation", "return", "below the best")]
