@@ -139,7 +139,7 @@ def test_an_expert_trained_further(tmp_path, capsys, monkeypatch):
                            (["--start", *[str(path)] * 3], "--start: expected at most 2"),
                            (["--start", str(path), str(path)], "expected ('ball_in_cup-catch', 2)"),
                            (["--start", str(path), "--mlp-dim", "8"], "an expert with a policy"),
-                           (["--plan-iterations", "0"], "at least 1"), ([], "not this run's")):
+                           (["--plan-iterations", "0"], "must be above 0"), ([], "not this run's")):
         assert train_gpu.main([*small, *wrong]) == 2
         assert message in capsys.readouterr().err
 
