@@ -1594,9 +1594,9 @@ class Environment:
                 reacher.Physics.from_xml_string(REACHER.read_text("ascii")),
                 reacher.Reacher(REACHER_TARGET[name], random=0), time_limit=20)
         else:
-            known = ["-".join(names) for names in suite.ALL_TASKS]
-            near = difflib.get_close_matches(str(task), [*TASKS, *known], n=1, cutoff=0)
-            need(task in known, f"unknown task {task!r}; did you mean {near[0]!r}? Known tasks: "
+            known = [*TASKS, *map("-".join, suite.ALL_TASKS)]
+            near = [] if task in known else difflib.get_close_matches(str(task), known, 1, 0)
+            need(not near, f"unknown task {task!r}; did you mean {''.join(near)!r}? Known tasks: "
                  f"{TASK_NAMES}")
             try:
                 self.env = suite.load(domain, name, task_kwargs={"random": 0})

@@ -282,7 +282,7 @@ def distil(task, seed, case, settings):
             if distiller.t % every and distiller.t < config.steps:
                 continue
             if planning.prior == "own":  # anew, however many evaluations there are
-                student.params.update({key: v.copy() for key, v in fresh.items()})
+                student.params.update(fresh)
                 fac.teach_priors(distiller, task, planning, 0)
             row = measure(student, task, planning, own["episodes"], environment)
             if not environment:  # others' ranks are of the robot's actions

@@ -62,12 +62,12 @@ def time_both(expert, student, obs):
 def argue(args, chosen):
     """What `distill` of these arguments doesn't say of its student, with the search `chosen`: the
     returns of the expert in the same search, and `time_both`, for its result."""
-    expert, header, replay, path = fac.load_data(args)
+    expert, header = fac.load_model(path := fac.data_file(args.task, "expert.npz"))
     student, about = fac.load_model(Path(args.out, "student.npz"), ["student"])
     own = {**fac.preset_values(fac.PlannerConfig, args.preset), **fac.made_for(header, path)}
     both = ((expert, fac.PlannerConfig(**own)),
             (student, fac.PlannerConfig(**{**fac.made_for(about, args.out), **chosen})))
-    found = time_both(*both, replay.observation[0].astype(fac.F32))
+    found = time_both(*both, np.zeros(student.config.dim_obs, fac.F32))
     if same := compared(*both).get("same_search"):
         model, planning = same
         found["same_search_returns"] = fac.evaluate(
