@@ -720,6 +720,7 @@ from pathlib import Path
 
 __version__ = "0.1.0"  # to be raised where plans change: recorded returns name it
 DATA = Path(__file__).resolve().parent / "data"
+EXPERTS = DATA / "experts"
 
 
 # ==== 6. Errors, and checks of settings where a user's values enter ===================
@@ -1902,11 +1903,11 @@ def data_checksums(expert, replay):
 
 
 def data_file(task, name):
-    """data/<task>/<name>; UserError that says what to do if it isn't there."""
+    """data/experts/TASK/<name>; UserError that says what to do if it isn't there."""
     lookup_task(task)
-    path = DATA / task / name
+    path = EXPERTS / task / name
     if not path.exists():
-        shipped = ", ".join(sorted(p.parent.name for p in DATA.glob("*/expert.npz"))) or "none"
+        shipped = ", ".join(sorted(p.parent.name for p in EXPERTS.glob("*/expert.npz"))) or "none"
         raise UserError(f"{path}: no such file; the repository holds {shipped}. Train one with "
                         f"'python data/train_expert.py --task {task}', give --expert, --replay")
     return path
@@ -2327,7 +2328,7 @@ def load_data(args):
     """(expert, its header, replay, the expert's path) that distill's arguments name."""
     lookup_task(args.task)
     path = Path(args.expert or data_file(args.task, "expert.npz"))
-    if path.is_dir():  # as train_expert.py and data/TASK hold them
+    if path.is_dir():  # as train_expert.py and data/experts/TASK hold them
         path /= "expert.npz"
     expert, header = load_model(path, ["expert"])
     need(header.get("task") == args.task, f"{path}: header: task: expected {args.task!r}, found "
@@ -2582,7 +2583,8 @@ def make_parser():
         "paper's method at this project's budget, without what it adds [D8] [D9]")
     add("--plain", action="store_true", help="Part I of the module alone: the plain preset, or "
         "the paper's, by the loop and the planner that it reads; slower, and not resumed")
-    add("--expert", help="expert file, or a folder with expert.npz and replay.npz [data/TASK]")
+    add("--expert", help="expert file, or a folder with expert.npz and replay.npz "
+        "[data/experts/TASK]")
     add("--replay", help="replay file [replay.npz beside the expert]")
     add("--out", help="folder for the results [runs/TASK-SEED]")
     add("--eval-seed", type=natural, default=0, help="of the evaluation episodes [0]")

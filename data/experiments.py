@@ -138,7 +138,7 @@ def attempt(function, run, home):
         try:
             settings = json.loads(run["settings"])
             fac.need(settings.get("data") == made_from(run["task"], settings),
-                     f"data/{run['task']} or a default has changed; give the command again")
+                     f"data/experts/{run['task']} or a default has changed; give the command again")
             settings.pop("data", None)
             found = list(function(run["task"], int(run["seed"]), run["case"], settings))
             fac.need(all(np.isfinite(v) for row in found for v in row.values()
@@ -663,7 +663,7 @@ def expert_level(task, rows):
     """The mean of an expert's recorded returns, of its own search but for the runs' samples and
     iterations; None: no record, or the runs are of another expert."""
     about = next((json.loads(settings) for own, _, _, settings in rows if own == task), {})
-    if not (path := fac.DATA / task / "expert.npz").exists():
+    if not (path := fac.EXPERTS / task / "expert.npz").exists():
         return None
     expert, header = fac.load_model(path)
     weights = fac.checksum(expert.params.values())
@@ -892,7 +892,7 @@ def make_parser():
 
     walkers = ["walker-walk", "walker-run"]
     curve = {"steps": 5000, "evaluations": 4, "episodes": 5}
-    shipped = [task for task in sorted(fac.TASKS) if (fac.DATA / task / "expert.npz").exists()]
+    shipped = [task for task in sorted(fac.TASKS) if (fac.EXPERTS / task / "expert.npz").exists()]
     add_cases("figure4", distil_and_time, FIGURE4, "Section 5.2: Fac-TDMPC, TD-MPC in Table 2's "
               "size and the small one of B.2, and TAP, by Algorithm 1; return against steps, then "
               "milliseconds (keep the machine quiet for these).", shipped)

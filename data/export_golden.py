@@ -3,8 +3,8 @@
 
     python data/export_golden.py [TASK ...]
 
-writes data/TASK/golden.npz for an expert and a replay that lie beside it (all tasks that have
-them), and data/golden-narrow.npz, small random networks. tests/test_golden.py holds the NumPy code
+writes data/experts/TASK/golden.npz for an expert and a replay that lie beside it (all tasks that
+have them), and golden-narrow.npz, small random networks. tests/test_golden.py holds the NumPy code
 to them without PyTorch. Each file keeps its inputs, float32, beside what comes out of them.
 """
 import dataclasses
@@ -295,7 +295,8 @@ def main(argv=None):
     parser = fac.Parser(prog="export_golden.py", description=(__doc__ or "").split("\n")[0])
     parser.set_defaults(run=run)
     parser.add_argument("tasks", nargs="*", metavar="TASK", help="[all that have an expert]")
-    parser.add_argument("--data", type=Path, default=fac.DATA, help="their folder [data/]")
+    parser.add_argument("--data", type=Path, default=fac.EXPERTS,
+                        help="their folder [data/experts]")
     parser.add_argument("--json", action="store_true",
                         help="print one JSON object as the last line of stdout")
     return fac.run_command(parser, argv)

@@ -398,7 +398,7 @@ def add_commands(commands):
         sub.add_argument("--seed", type=fac.natural, default=0, help="of the episodes [0]")
         sub.add_argument("--episodes", type=positive, default=episodes, help="[%(default)s]")
         sub.add_argument("--out", default=f"{name}.png", help="the picture [%(default)s]")
-    sub.add_argument("--expert", help="the expert's file or folder [data/TASK]")
+    sub.add_argument("--expert", help="the expert's file or folder [data/experts/TASK]")
     sub.add_argument("--replay", help="[replay.npz beside the expert]")
     sub.add_argument("--states", type=positive, default=256, help="held-out ones [%(default)s]")
     commands.choices["figure9"].add_argument(

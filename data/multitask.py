@@ -45,8 +45,8 @@ def named(tasks):
 
 def small_tasks():
     """The tasks in data/ whose robots have at most MOST_ACTIONS action dimensions."""
-    found = sorted(path.parent.name for path in fac.DATA.glob("*/expert.npz"))
-    fac.need(found, f"{fac.DATA}: holds no experts; name --data and --tasks")
+    found = sorted(path.parent.name for path in fac.EXPERTS.glob("*/expert.npz"))
+    fac.need(found, f"{fac.EXPERTS}: holds no experts; name --data and --tasks")
     return [task for task in found if fac.lookup_task(task)[3] <= MOST_ACTIONS]
 
 
@@ -77,7 +77,7 @@ def load_data(task, args, checkpoint, seed, folder):
         expert, header, replay, path = fac.load_data(argparse.Namespace(
             task=task, expert=args.data and Path(args.data) / task, replay=None))
         return expert, fac.PlannerConfig(**fac.made_for(header, path)), replay
-    expert, path = checkpoint.teacher(task), Path(args.data or fac.DATA) / task / "replay.npz"
+    expert, path = checkpoint.teacher(task), Path(args.data or fac.EXPERTS) / task / "replay.npz"
     if args.collect:
         path = collect(checkpoint, task, args.collect, seed, folder)
     fac.need(path.exists(), f"{path}: no such file; --collect 20 has the teacher play instead")
@@ -415,7 +415,7 @@ def make_parser():
                              f"gradient steps in all [{fac.DistillConfig.steps} for each task]")
             fac.add_config(sub, fac.DistillConfig, skip=(
                 "steps", "targets", "encoder_input", "priors"))
-        sub.add_argument("--data", help="folder with TASK/expert.npz and replay.npz [data]")
+        sub.add_argument("--data", help="folder with TASK/expert.npz and replay.npz [data/experts]")
         return sub.add_argument
 
     def add_teacher(option):

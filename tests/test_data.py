@@ -596,7 +596,7 @@ def test_a_student_s_file_plans_over_what_it_was_distilled_for():
 
 
 def test_data_file(tmp_path, monkeypatch):
-    monkeypatch.setattr(fac, "DATA", tmp_path)
+    monkeypatch.setattr(fac, "EXPERTS", tmp_path)
     message = refusal(lambda: fac.data_file("fish-swim", "expert.npz"),
                       tmp_path / "fish-swim" / "expert.npz", "holds none",
                       "train_expert.py --task fish-swim", "--expert", "--replay")

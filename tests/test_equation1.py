@@ -80,8 +80,8 @@ def golden_case(source):
         header, g = fac.read_npz(NARROW, ("golden",))
         models = [narrow_expert(header, g, prefix) for prefix in ("model ", "target ")]
     else:
-        header, g = fac.read_npz(fac.DATA / source / "golden.npz", ("golden",))
-        models = [fac.load_model(fac.DATA / source / "expert.npz")[0]] * 2
+        header, g = fac.read_npz(fac.EXPERTS / source / "golden.npz", ("golden",))
+        models = [fac.load_model(fac.EXPERTS / source / "expert.npz")[0]] * 2
     return *models, g, ExpertConfig(**present(ExpertConfig, header["training"]))
 
 

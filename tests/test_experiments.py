@@ -743,7 +743,7 @@ def test_a_run_made_with_other_defaults_is_another_run(monkeypatch):
         monkeypatch.setattr(fac, "PlannerConfig", config_class)
         assert experiments.main(["sweep", *flags]) == 0
     assert seen[0] == seen[1] != seen[2]
-    expected = "data/reacher-hard or a default has changed; give the command again"
+    expected = "data/experts/reacher-hard or a default has changed; give the command again"
     assert expected in experiments.attempt(experiments.distil, seen[0], os.getpid())[-1]["error"]
     settings = {"decisions": 4000, "episodes": 1}
     before = experiments.made_from("walker-walk", {"data": 0, **settings})
@@ -829,7 +829,7 @@ def test_runs_of_other_settings_don_t_make_one_figure(tmp_path, capsys, case, se
 def test_a_report_needs_no_expert(tmp_path, monkeypatch):
     rows = [{"step": 1, "return_mean": 7.0, "minutes": 1.0}]
     write_rows(tmp_path / "figure4.csv", [("walker-run", 0, "TAP", {"data": [1]}, rows)])
-    monkeypatch.setattr(fac, "DATA", tmp_path)
+    monkeypatch.setattr(fac, "EXPERTS", tmp_path)
     monkeypatch.setattr(experiments, "draw_lines", lambda *_, **__: None)
     result, table = experiments.report_curves("figure4", tmp_path / "figure4.csv", tmp_path)
     assert result["walker-run"]["TAP"]["mean"] == 7 and "| walker-run | 7 | - |" in table
@@ -1336,7 +1336,7 @@ def test_watch_writes_a_moving_picture(tmp_path, name, task):
 @pytest.mark.parametrize("flags, parts", [
     (["--model", "none.npz", "--out", "x.gif"], ["none.npz", "no such file"]),
     (["--model", "slow.npz", "--out", "x.gif", "--decisions", "251"], ["250", "251"]),
-    (["--model", "slow.npz", "--beside", fac.DATA / "reacher-hard" / "expert.npz", "--out",
+    (["--model", "slow.npz", "--beside", fac.EXPERTS / "reacher-hard" / "expert.npz", "--out",
       "x.gif"], ["expert.npz: decides every 2 control steps", "slow.npz every 4"]),
     (["--model", "none.npz", "--out", "x.png"], ["x.png", ".gif", ".mp4"])])
 def test_watch_refuses(tmp_path, flags, parts):

@@ -12,7 +12,7 @@ from export_golden import digest
 from numpy_learner import ExpertConfig
 from test_layers import UNSEEN
 
-TASKS = sorted(p.parent.name for p in fac.DATA.glob("*/golden.npz"))
+TASKS = sorted(p.parent.name for p in fac.EXPERTS.glob("*/golden.npz"))
 FORWARD, GRADIENT, ADAM = 1e-5, 1e-4, 1e-5  # relative to the largest entry, or to the norm
 
 
@@ -35,7 +35,7 @@ def assert_digest(array, expected, tolerance, size=None):
 
 @pytest.fixture(scope="module", params=TASKS)
 def golden(request):
-    folder = fac.DATA / request.param
+    folder = fac.EXPERTS / request.param
     model, _ = fac.load_model(folder / "expert.npz")
     header, arrays = fac.read_npz(folder / "golden.npz", ("golden",))
     return model, header, arrays
@@ -143,7 +143,7 @@ def test_ten_adam_steps(golden, dtype):
 
 # ------------------------------------------------------- the narrow networks, in full
 
-NARROW = fac.DATA / "golden-narrow.npz"
+NARROW = fac.EXPERTS / "golden-narrow.npz"
 
 
 def narrow_case(tag, dtype):
@@ -234,11 +234,11 @@ def test_pytorch_computes_what_the_narrow_file_holds(export_golden):
 def test_the_export_writes_files_of_the_same_entries(tmp_path, export_golden, capsys):
     (tmp_path / "reacher-hard").mkdir()
     for name in ("expert.npz", "replay.npz"):
-        shutil.copy(fac.DATA / "reacher-hard" / name, tmp_path / "reacher-hard")
+        shutil.copy(fac.EXPERTS / "reacher-hard" / name, tmp_path / "reacher-hard")
     assert export_golden.main(["--data", str(tmp_path)]) == 0
     for name in ("reacher-hard/golden.npz", "golden-narrow.npz"):
         header, found = fac.read_npz(tmp_path / name, ("golden",))
-        shipped, expected = fac.read_npz(fac.DATA / name, ("golden",))
+        shipped, expected = fac.read_npz(fac.EXPERTS / name, ("golden",))
         assert set(header) == set(shipped)
         assert {k: (v.shape, v.dtype) for k, v in found.items()} == {
             k: (v.shape, v.dtype) for k, v in expected.items()}
@@ -251,6 +251,6 @@ def test_the_export_writes_files_of_the_same_entries(tmp_path, export_golden, ca
             ({"kind": "student"}, set(), "'student'"))):
         fac.write_npz(tmp_path / str(i) / "expert.npz", {**header, **changed},
                       {key: weights[key] for key in weights.keys() - without})
-        shutil.copy(fac.DATA / "reacher-hard" / "replay.npz", tmp_path / str(i))
+        shutil.copy(fac.EXPERTS / "reacher-hard" / "replay.npz", tmp_path / str(i))
         assert export_golden.main(["--data", str(tmp_path), str(i)]) == 2
         assert part in capsys.readouterr().err
