@@ -19,10 +19,9 @@ import time
 from pathlib import Path
 
 import numpy as np
-from test_cli import ONE_THREAD, ROOT, TINY, write_expert, write_replay
 
 import fac_tdmpc_ref as fac
-from test_planning import random_model
+from toys import ONE_THREAD, ROOT, TINY, random_model, write_expert, write_replay
 
 FAST_CLOCK = ("import sys, time; clock = time.monotonic; time.monotonic = lambda: 60 * clock(); "
               f"sys.path.insert(0, {str(ROOT)!r}); import fac_tdmpc_ref; "

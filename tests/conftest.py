@@ -1,6 +1,11 @@
 import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small products; more threads only wait
+
+import pytest  # noqa: E402
+
+from toys import BLOCKED, ONE_THREAD, fac, write_expert, write_replay  # noqa: E402
+
 SKIPPED = []  # tests, and files of them, of this run
 
 
@@ -25,3 +30,35 @@ def pytest_collection_modifyitems(config, items):
 
 def pytest_sessionfinish(session):
     session.config.cache.set("skipped", SKIPPED)
+
+
+@pytest.fixture(scope="session")
+def files(tmp_path_factory):
+    """A folder with an expert, a replay and things that are neither."""
+    folder = tmp_path_factory.mktemp("files")
+    write_expert(folder / "expert.npz")
+    write_expert(folder / "other.npz", seed=1)
+    write_expert(folder / "wider.npz", latent=7)
+    write_expert(folder / "spoilt.npz")
+    (folder / "spoilt.json").write_text('{"x": 3}')
+    write_replay(folder / "replay.npz")
+    write_replay(folder / "walker.npz", (24, 6))
+    write_replay(folder / "longer.npz", (8, 3), 3, 60)  # the same rows, other ends
+    write_replay(folder / "named.npz", task="reacher-hard")
+    (folder / "corrupt.npz").write_bytes((folder / "expert.npz").read_bytes()[:3000])
+    return folder
+
+
+@pytest.fixture(scope="session")
+def no_plots(tmp_path_factory):
+    """Settings under which matplotlib can't be imported; runs end sooner without it, too."""
+    folder = tmp_path_factory.mktemp("blocked")
+    (folder / "matplotlib.py").write_text(BLOCKED)
+    return {"PYTHONPATH": str(folder), **ONE_THREAD}
+
+
+@pytest.fixture(scope="session")
+def replay(tmp_path_factory):
+    """24 episodes of 30 decisions."""
+    return fac.Replay(write_replay(tmp_path_factory.mktemp("replay") / "replay.npz", (8, 3), 24, 31,
+                                   0))

@@ -8,8 +8,7 @@ import pytest
 
 import fac_tdmpc_ref as fac
 import look
-from test_cli import BUDGET, TINY, write_expert, write_replay
-from test_planning import random_model
+from toys import BUDGET, TINY, Joints, random_model, write_expert, write_replay
 
 GROUPS, ORDER = "2,0/3,1", [2, 0, 3, 1]
 BACK = np.argsort(ORDER)
@@ -24,25 +23,6 @@ def permuted(expert):
     for part in ("weight", "bias"):
         params[f"_pi.4.{part}"] = params[f"_pi.4.{part}"][:, ORDER]
     return fac.WorldModel(expert.config, params)
-
-
-class Robot:
-    """Four joints that move by what they are told, and their sum; `order`: of its joints."""
-
-    episode_steps = 12
-
-    def __init__(self, order=slice(None)):
-        self.order = order
-
-    def reset(self, seed):
-        self.state = np.random.default_rng(seed).standard_normal(8)
-        return self.state
-
-    def step(self, action):
-        joints = np.empty(4)
-        joints[self.order] = action
-        self.state = 0.9 * self.state + 0.3 * np.r_[joints, np.cumsum(joints)]
-        return self.state, self.state[0] - self.state[5]
 
 
 def replay_of(path, order):
@@ -70,7 +50,7 @@ def test_a_grouping_learns_and_plans_as_the_plain_cut_of_a_permuted_robot(tmp_pa
             contextlib.closing(fac.Distiller(
                 permuted(expert), replay_of(tmp_path / "b.npz", ORDER), config, 2)) as plain:
         around = fac.PlannerConfig(**{**fac.STUDENT_PLANNING, "samples": 16})
-        obs, action = fac.expert_episodes(grouped, None, around, environment=Robot())
+        obs, action = fac.expert_episodes(grouped, None, around, environment=Joints())
         ours = learned(grouped, (obs, action), real, monkeypatch)
         theirs = learned(plain, (obs, action[..., ORDER]), lambda actions, *rest: real(
             actions[:, BACK], *rest)[:, ORDER], monkeypatch)
@@ -88,8 +68,8 @@ def test_a_grouping_learns_and_plans_as_the_plain_cut_of_a_permuted_robot(tmp_pa
         k: v for k, v in plain.student.params.items() if k.startswith("_expert")}})
     for prior in ("own", "last"):
         config = dataclasses.replace(around, prior=prior)
-        ours = fac.play(grouped.student, None, config, [3, 4], environment=Robot())
-        theirs = fac.play(twin, None, config, [3, 4], environment=Robot(ORDER))
+        ours = fac.play(grouped.student, None, config, [3, 4], environment=Joints())
+        theirs = fac.play(twin, None, config, [3, 4], environment=Joints(ORDER))
         for x, y in ((ours[0], theirs[0]), (ours[2], theirs[2])):
             assert np.allclose(x, y, atol=1e-3)
         assert np.allclose(ours[1][..., ORDER], theirs[1], atol=1e-3)

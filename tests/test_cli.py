@@ -20,67 +20,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+import fac_tdmpc_ref as fac
+from toys import (BUDGET, ONE_THREAD, ROOT, SCRIPT, STEPS, TINY, TRAINING, WATCHED,
+                  distill_arguments, last_json, launch, random_model, refused, run, student_in,
+                  succeeded, write_expert)
 
-import fac_tdmpc_ref as fac  # noqa: E402
-from test_planning import random_model  # noqa: E402
-
-SCRIPT = ROOT / "fac_tdmpc_ref.py"
-STEPS = 6
-BUDGET = ["--samples", "16", "--iterations", "1"]
-TINY = ["--steps", str(STEPS), "--batch-size", "4", "--horizon", "1", "--held-out", "0.34",
-        "--warmup", "2", "--expert-episodes", "0", "--episodes", "1", "--plan-samples", "16",
-        "--plan-iterations", "1"]
-# BLAS threads that wait for a busy core make runs many times longer
-ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-BLOCKED = "raise ImportError('blocked by a test')\n"
 KEYS = {"task", "seed", "steps", "seconds", "expert_return_mean", "expert_return_std",
         "student_return_mean", "student_return_std", "episodes", "kl_reward", "kl_value",
         "rank_correlation", "plan_ms_expert", "plan_ms_student", "speedup", "expert_recorded",
         "out"}
-
-
-def write_expert(path, task="reacher-hard", dims=(8, 3), seed=0, latent=6):
-    rng = np.random.default_rng(seed)
-    config = fac.ModelConfig(*dims, num_agents=1, latent_dim=latent, enc_dim=16, mlp_dim=24)
-    model = fac.WorldModel.create(config, rng, policy=True)
-    for key in ("_reward.4.weight", "_Q1.5.weight", "_Q2.5.weight"):  # zero: nothing to learn from
-        model.params[key] = rng.standard_normal(model.params[key].shape, np.float32)
-    fac.save_model(path, model, {"kind": "expert", "task": task})
-
-
-def write_replay(path, dims=(8, 3), episodes=6, rows=30, task=None):
-    rng, n = np.random.default_rng(1), episodes * rows
-    fac.write_npz(path, {"kind": "replay", "task": task}, {
-        "observation": rng.standard_normal((n, dims[0])).astype(np.float16),
-        "action": rng.uniform(-1, 1, (n, dims[1])).astype(np.float16),
-        "continues": np.arange(1, n + 1) % rows != 0})
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    """A folder with an expert, a replay and things that are neither."""
-    folder = tmp_path_factory.mktemp("files")
-    write_expert(folder / "expert.npz")
-    write_expert(folder / "other.npz", seed=1)
-    write_expert(folder / "wider.npz", latent=7)
-    write_expert(folder / "spoilt.npz")
-    (folder / "spoilt.json").write_text('{"x": 3}')
-    write_replay(folder / "replay.npz")
-    write_replay(folder / "walker.npz", dims=(24, 6))
-    write_replay(folder / "longer.npz", episodes=3, rows=60)  # the same rows, other ends
-    write_replay(folder / "named.npz", task="reacher-hard")
-    (folder / "corrupt.npz").write_bytes((folder / "expert.npz").read_bytes()[:3000])
-    return folder
-
-
-@pytest.fixture(scope="module")
-def no_plots(tmp_path_factory):
-    """Settings under which matplotlib can't be imported; runs end sooner without it, too."""
-    folder = tmp_path_factory.mktemp("blocked")
-    (folder / "matplotlib.py").write_text(BLOCKED)
-    return {"PYTHONPATH": str(folder), **ONE_THREAD}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -90,61 +38,7 @@ def one_thread():
         yield
 
 
-def launch(command, cwd, env=ONE_THREAD):
-    return subprocess.run([sys.executable, *map(str, command)], cwd=cwd, capture_output=True,
-                          text=True, encoding="utf-8", timeout=120,
-                          env={**os.environ, "PYTHONIOENCODING": "utf-8", **env})
-
-
-def run(*arguments, cwd, env=ONE_THREAD):
-    return launch([SCRIPT, *arguments], cwd, env)
-
-
-def distill_arguments(files, *more):
-    return ["distill", "--expert", files / "expert.npz", "--replay", files / "replay.npz", *TINY,
-            *more]
-
-
-def succeeded(done):
-    assert done.returncode == 0, done.stderr
-    return done
-
-
-def last_json(done):
-    """The last line of stdout, as strict JSON: NaN and Infinity are none."""
-    def refuse(constant):
-        raise AssertionError(f"{constant} is not JSON")
-
-    return json.loads(succeeded(done).stdout.splitlines()[-1], parse_constant=refuse)
-
-
-def student_of(folder):
-    """{key: bytes} of a student's weights, and its header."""
-    model, header = fac.load_model(folder / "student.npz")
-    return {k: v.tobytes() for k, v in model.params.items()}, header
-
-
 # help ---------------------------------------------------------------------------------
-
-WATCHED = f"""
-import os, sys
-sys.path.insert(0, {str(ROOT)!r})
-def refuse(*_):
-    raise RuntimeError("a process was started")
-def audit(event, _):
-    if event in ("subprocess.Popen", "os.fork", "os.posix_spawn", "os.system", "os.exec"):
-        refuse()
-sys.addaudithook(audit)
-import _posixsubprocess
-_posixsubprocess.fork_exec = refuse   # what multiprocessing starts processes with, unaudited
-import fac_tdmpc_ref as fac
-try:
-    fac.main(sys.argv[1:])
-except SystemExit as end:
-    heavy = {{"mujoco", "dm_control", "matplotlib", "torch", "scipy", "tqdm"}} & set(sys.modules)
-    assert not heavy, heavy
-    sys.exit(end.code)
-"""
 
 
 @pytest.mark.parametrize("command, expected", [
@@ -269,17 +163,6 @@ def test_interrupt_is_one_line_and_status_130(monkeypatch, capsys):
 
 
 # bad input ----------------------------------------------------------------------------
-
-
-def refused(done, *parts, program="fac_tdmpc_ref.py"):
-    """Status 2 and one line on stderr that holds `parts`; returns the line."""
-    assert done.returncode == 2, done.stderr
-    assert done.stdout == ""
-    assert done.stderr.count("\n") == 1 and done.stderr.endswith("\n"), done.stderr
-    assert done.stderr.startswith(program) and ": error: " in done.stderr
-    for part in parts:
-        assert part in done.stderr
-    return done.stderr
 
 
 @pytest.mark.parametrize("flags, parts", [
@@ -760,7 +643,7 @@ def test_the_curve_is_a_table_of_numbers(distilled):
 
 def test_the_student_differs_from_its_start(distilled, files):
     """Guards the comparisons of weights below: training did change them."""
-    weights, header = student_of(distilled[1])
+    weights, header = student_in(distilled[1])
     expert, _ = fac.load_model(files / "expert.npz")
     config = fac.from_dict(fac.DistillConfig, header["distill"], "student")
     distiller = fac.Distiller(expert, fac.Replay(files / "replay.npz"), config)
@@ -778,7 +661,7 @@ def test_the_same_command_gives_the_same_student(tmp_path, files, distilled, no_
     done = run(*distill_arguments(files, "--workers", "1", "--json", "--out", "here"),
                cwd=tmp_path, env=no_plots)
     first, again = last_json(distilled[0]), last_json(done)
-    assert student_of(tmp_path / "here") == student_of(distilled[1])
+    assert student_in(tmp_path / "here") == student_in(distilled[1])
     for key in ("student_returns", "expert_returns", "kl_reward", "kl_value",
                 "rank_correlation_by_step", "rank_correlation_returns"):
         assert again[key] == first[key]
@@ -832,13 +715,13 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(killed, distilled):
     assert first.returncode == -signal.SIGKILL
     assert not (out / "student.npz").exists()
     succeeded(distill())
-    assert student_of(out) == student_of(distilled[1])
+    assert student_in(out) == student_in(distilled[1])
     assert rows_without_seconds(out / "curve.csv") == rows_without_seconds(
         distilled[1] / "curve.csv")
     assert (out / "result.json").exists()
-    before = student_of(out), (out / "curve.csv").read_bytes()
+    before = student_in(out), (out / "curve.csv").read_bytes()
     succeeded(distill("--episodes", "2", stop=0))  # it is over: nothing begins again
-    assert (student_of(out), (out / "curve.csv").read_bytes()) == before
+    assert (student_in(out), (out / "curve.csv").read_bytes()) == before
 
 
 def test_a_killed_run_whose_expert_plays_goes_on(tmp_path, files, no_plots):
@@ -857,10 +740,10 @@ def test_a_killed_run_whose_expert_plays_goes_on(tmp_path, files, no_plots):
         assert file["played"].shape == (2 * fac.EPISODE_STEPS, 8 + 3)  # states and actions
         assert file["lengths"].tolist() == [fac.EPISODE_STEPS] * 2
     succeeded(distill("parts"))
-    assert student_of(tmp_path / "parts") == student_of(tmp_path / "whole")
+    assert student_in(tmp_path / "parts") == student_in(tmp_path / "whole")
     without = distill_arguments(files, "--out", tmp_path / "without")
     succeeded(launch(["-c", DRIVER, -1, *without], tmp_path, no_plots))
-    assert student_of(tmp_path / "without")[0] != student_of(tmp_path / "whole")[0]
+    assert student_in(tmp_path / "without")[0] != student_in(tmp_path / "whole")[0]
 
 
 @pytest.mark.parametrize("flags, parts", [
@@ -945,7 +828,6 @@ def test_two_runs_into_one_folder_do_not_both_begin(tmp_path, files, capsys):
     """Whatever the first was; one that was killed leaves no lock."""
     import import_expert
     import train_expert
-    from test_train import TINY as TRAINING
     expert, out = str(files / "expert.npz"), str(tmp_path / "out")
     runs = [(fac.main, distill_arguments(files, "--task", "reacher-hard", "--workers", "0")),
             (train_expert.main, [*TRAINING, "--minutes", "1e-9"]),
@@ -983,6 +865,7 @@ def test_where_there_are_no_locks_a_run_goes_on(tmp_path, monkeypatch, missing):
 
 
 # evaluate and the record of the expert ------------------------------------------------
+
 
 def test_what_is_kept_is_the_student_s_return_by_the_expert_s(monkeypatch):
     monkeypatch.setattr(fac, "evaluate", lambda *_: {"returns": [4.0, 8.0]})

@@ -3,21 +3,17 @@
 import errno
 import json
 import os
-import sys
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-
-import fac_tdmpc_ref as fac  # noqa: E402
-from export_golden import digest  # noqa: E402
-from numpy_learner import ExpertConfig  # noqa: E402
+import fac_tdmpc_ref as fac
+from export_golden import digest
+from numpy_learner import ExpertConfig
+from toys import refusal, replay_arrays, write_replay
 
 F32 = np.float32
 
@@ -50,36 +46,10 @@ def write_raw(path, header, arrays):
     return path
 
 
-def refusal(call, *parts):
-    """The message of the UserError that `call` raises; it is one line and holds all `parts`."""
-    with pytest.raises(fac.UserError) as caught:
-        call()
-    message = str(caught.value)
-    assert "\n" not in message
-    for part in parts:
-        assert str(part) in message
-    return message
-
-
 @pytest.fixture
 def expert_file(tmp_path):
     path = tmp_path / "expert.npz"
     fac.save_model(path, make_model(policy=True), {"kind": "expert", "task": "t"})
-    return path
-
-
-def replay_arrays(episodes=6, rows=30, dim_obs=8, dim_action=3):
-    rng = np.random.default_rng(1)
-    n = episodes * rows
-    return {"observation": rng.standard_normal((n, dim_obs)).astype(np.float16),
-            "action": rng.uniform(-1, 1, (n, dim_action)).astype(np.float16),
-            "continues": np.arange(1, n + 1) % rows != 0}
-
-
-def write_replay(path, **changes):
-    arrays = {**replay_arrays(), **changes}
-    fac.write_npz(path, {"kind": "replay"}, {k: v for k, v in arrays.items() if v is not None},
-                  compress=True)
     return path
 
 

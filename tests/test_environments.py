@@ -4,19 +4,15 @@ import functools
 import os
 import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-
-import fac_tdmpc_ref as fac  # noqa: E402
-import look  # noqa: E402
-import train_expert  # noqa: E402
-from test_planning import random_model  # noqa: E402
+import fac_tdmpc_ref as fac
+import look
+import train_expert
+from toys import ROOT, random_model
 
 FIGURE_3 = {  # task: (dim O, dim A), copied from the paper and not from the code
     "reacher-easy": (8, 3), "reacher-hard": (8, 3), "hopper-hop": (15, 4), "fish-swim": (24, 5),

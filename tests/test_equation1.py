@@ -5,28 +5,9 @@ import numpy as np
 import pytest
 
 import fac_tdmpc_ref as fac
-from numpy_learner import ExpertConfig, Learner, equation_1, policy_loss, td_targets
-from test_golden import (FORWARD, GRADIENT, NARROW, TASKS, assert_digest, narrow_expert, present,
-                         relative)
-from test_layers import assert_close, numeric_gradient
-
-CONFIG = ExpertConfig(latent_dim=3, enc_dim=5, mlp_dim=6, lam=0.7, batch_size=4,
-                      consistency_coef=1.5, value_coef=0.3)
-
-
-def small_learner(rng, dtype=np.float64):
-    """A learner whose every weight is alive, its moving averages apart from its model."""
-    learner = Learner(fac.ModelConfig(4, 2, 1, 3, 5, 6), CONFIG, rng, dtype)
-    for vector in (learner.optimizer.vector, learner.policy_optimizer.vector, learner.slow_vector):
-        vector += 0.3 * rng.standard_normal(vector.shape).astype(dtype)
-    return learner
-
-
-def small_batch(rng, steps=3, batch=4, dtype=np.float64):
-    """obs (H + 1, O, B), actions (H, A, B), reward (H, B)."""
-    return (rng.standard_normal((steps + 1, 4, batch)).astype(dtype),
-            rng.uniform(-1, 1, (steps, 2, batch)).astype(dtype),
-            rng.standard_normal((steps, batch)).astype(dtype))
+from numpy_learner import ExpertConfig, equation_1, policy_loss, td_targets
+from toys import (EQUATION_1, FORWARD, GOLDEN, GRADIENT, NARROW, assert_close, assert_digest,
+                  narrow_expert, numeric_gradient, present, relative, small_batch, small_learner)
 
 
 @pytest.mark.parametrize("steps, batch", [(3, 4), (1, 1), (4, 2)])
@@ -36,7 +17,7 @@ def test_gradients_through_the_rollout(steps, batch):
     obs, actions, reward = small_batch(rng, steps, batch)
     latents, td = td_targets(learner.model, learner.target, obs[1:], reward,
                                  np.zeros((2, steps * batch)), 0.9)
-    case = obs[0], actions, reward, latents, td, CONFIG
+    case = obs[0], actions, reward, latents, td, EQUATION_1
     equation_1(learner.model, *case, learner.optimizer.grads)
     for key, value in learner.optimizer.params.items():
         expected = numeric_gradient(lambda: equation_1(learner.model, *case)[0], value)
@@ -86,7 +67,7 @@ def golden_case(source):
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("source", ["narrow", *TASKS])
+@pytest.mark.parametrize("source", ["narrow", *GOLDEN])
 def test_golden_loss_and_gradients(source, dtype):
     """The loss squares small differences of Q and target, so float32 rounds it like a gradient."""
     model, target, g, config = golden_case(source)
@@ -126,7 +107,7 @@ def test_ten_updates_are_pytorch_s(dtype, tolerance):
     pytest.importorskip("torch")
     from torch_learner import TorchLearner, torch
     ours = small_learner(np.random.default_rng(3), dtype)
-    ours.config = dataclasses.replace(CONFIG, grad_clip=0.5, tau=0.1)
+    ours.config = dataclasses.replace(EQUATION_1, grad_clip=0.5, tau=0.1)
     copy = {k: v.copy() for k, v in ours.model.params.items()}
     theirs = TorchLearner(fac.WorldModel(ours.model.config, copy), ours.config, "cpu")
     for key, value in ours.target.params.items():
@@ -145,10 +126,10 @@ def test_ten_updates_are_pytorch_s(dtype, tolerance):
 def test_half_precision_ends_at_the_last_layer():
     pytest.importorskip("torch")
     from torch_learner import TorchLearner, heads, torch
-    learner = TorchLearner(small_learner(np.random.default_rng(0), np.float32).model, CONFIG,
+    learner = TorchLearner(small_learner(np.random.default_rng(0), np.float32).model, EQUATION_1,
                            "cpu", "bfloat16")
     torch.manual_seed(0)
-    x = torch.randn(1, 50, CONFIG.latent_dim + 2)
+    x = torch.randn(1, 50, EQUATION_1.latent_dim + 2)
     torch.nn.init.normal_(learner.params["_Q1.5.weight"])
     with torch.no_grad():
         with learner._autocast():

@@ -22,15 +22,12 @@ import plots
 import speed
 import students
 import tables
-import test_cli
-import test_distill
+import toys
 import train_expert
-from test_cli import BLOCKED, ONE_THREAD, ROOT, last_json, launch, write_expert
-from test_layers import assert_close, numeric_gradient
-from test_planning import random_model
+from toys import (BLOCKED, CONFIG, ONE_THREAD, ROOT, SET, SWEEP, assert_close, last_json, launch,
+                  numeric_gradient, random_model, write_expert)
 
-refused = functools.partial(test_cli.refused, program="experiments.py")
-replay = test_distill.replay
+refused = functools.partial(toys.refused, program="experiments.py")
 
 
 def run(*arguments, cwd, env=ONE_THREAD):
@@ -139,10 +136,6 @@ def test_help_teaches():
 
 # runs ---------------------------------------------------------------------------------
 
-SMALL = ["--tasks", "cheetah-run", "--seeds", "0", "--steps", "4", "--episodes", "1", "--samples",
-         "8", "--iterations", "1", "--out", "sweep.csv"]
-SET = ["expert-episodes=0", "batch-size=2"]
-
 
 def rows_of(path):
     """{settings: rows} of a CSV's finished runs, without what the clock says."""
@@ -152,7 +145,7 @@ def rows_of(path):
 
 def test_a_killed_sweep_goes_on_and_makes_no_run_twice(tmp_path):
     pytest.importorskip("joblib")
-    flags = ["sweep", *SMALL, "--set", *SET, "lr=1e-3,2e-3,3e-3,4e-3,5e-3", "--jobs", "2"]
+    flags = [*SWEEP, *SET, "lr=1e-3,2e-3,3e-3,4e-3,5e-3", "--jobs", "2"]
     process = subprocess.Popen([sys.executable, ROOT / "data" / "experiments.py", *flags],
                                cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     path, begun = tmp_path / "sweep.csv", time.time()
@@ -176,7 +169,7 @@ def test_a_killed_sweep_goes_on_and_makes_no_run_twice(tmp_path):
 
 def test_a_failed_run_is_a_row_and_is_tried_again(tmp_path):
     pytest.importorskip("joblib")
-    flags = ["sweep", *SMALL, "--set", *SET, "noise-samples=3,1000000000"]
+    flags = [*SWEEP, *SET, "noise-samples=3,1000000000"]
     for _ in range(2):
         done = run(*flags, "--json", cwd=tmp_path)
         assert done.returncode == 1 and "allocate" in done.stderr
@@ -265,7 +258,7 @@ def test_a_csv_is_one_command_s_until_it_ends(tmp_path):
 
 def test_workers_end_with_the_process_that_waits_for_them(tmp_path):
     pytest.importorskip("joblib")
-    flags = ["sweep", *SMALL[:-1], "orphan.csv", "--set", *SET, "lr=1e-3,2e-3", "--jobs", "2",
+    flags = [*SWEEP[:-1], "orphan.csv", *SET, "lr=1e-3,2e-3", "--jobs", "2",
              "--steps", "100000"]
     process = subprocess.Popen([sys.executable, ROOT / "data" / "experiments.py", *flags],
                                cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -299,7 +292,7 @@ def test_workers_end_with_the_process_that_waits_for_them(tmp_path):
 def test_dask_gives_the_rows_that_processes_give(tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed")
     pytest.importorskip("joblib")
-    flags = ["sweep", *SMALL, "--set", *SET, "num-agents=3,6"]
+    flags = [*SWEEP, *SET, "num-agents=3,6"]
     last_json(run(*flags, "--json", cwd=tmp_path))
     here = rows_of(tmp_path / "sweep.csv")
     monkeypatch.setenv("PYTHONPATH", str(ROOT / "data"))
@@ -446,7 +439,7 @@ def test_every_method_of_figure_4_learns_from_its_run_s_seed(replay, monkeypatch
         weights = []
         for seed in (3, 3, 4):
             distiller = baselines.distiller_of(case)(
-                random_model(1, hidden=512, policy=True), replay, test_distill.CONFIG,
+                random_model(1, hidden=512, policy=True), replay, CONFIG,
                 settings.get("num_agents"), seed)
             distiller.close()
             weights.append(distiller.optimizer.vector)
@@ -781,7 +774,7 @@ def test_the_cases_of_figure_5_learn_what_they_say():
 def test_goals_of_the_consistency_loss_are_the_expert_s_next_latents(replay):
     expert = random_model(n=1, policy=True)
     with contextlib.closing(baselines.ConsistentDistiller(expert, replay,
-                                                          test_distill.CONFIG)) as distiller:
+                                                          CONFIG)) as distiller:
         z, actions, targets = distiller.draw(0, 0, 4)
     z = np.repeat(z, actions.shape[3], 2)
     assert targets[-1].shape == (6, 4, *actions.shape[2:]) and len(actions) == 4
@@ -1059,6 +1052,7 @@ def test_report_draws_what_the_csvs_hold(tmp_path):
 
 
 # students -----------------------------------------------------------------------------
+
 
 def write_student_rows(path, policy=(90.0, 110.0)):
     """Two seeds of a default student, one of the paper's, and a budget chosen by flags."""

@@ -7,13 +7,7 @@ import sys
 import pytest
 
 import experiments
-import test_cli
-import test_train
-from test_cli import ROOT, distill_arguments, files, launch, student_of, succeeded
-from test_experiments import SET, SMALL
-from test_import_expert import weights, write_state
-
-__all__ = ["files"]  # a fixture
+from toys import ROOT, SET, SWEEP, TRAINING, distill_arguments, launch, run, student_in, succeeded
 
 LIMITED = """
 import os, resource, runpy, sys
@@ -76,28 +70,26 @@ def test_distill(tmp_path, files):
     for size in (50, 1000):
         full_disk("checkpoint.npz", size, "fac_tdmpc_ref.py", *command, "--out", "a", cwd=tmp_path)
     for out in ("a", "b"):
-        succeeded(test_cli.run(*command, "--out", out, cwd=tmp_path))
-    assert student_of(tmp_path / "a") == student_of(tmp_path / "b")
+        succeeded(run(*command, "--out", out, cwd=tmp_path))
+    assert student_in(tmp_path / "a") == student_in(tmp_path / "b")
 
 
 def test_train_expert(tmp_path):
-    full_disk("checkpoint.npz", 1000, "data/train_expert.py", *test_train.TINY, "--out", "a",
-              cwd=tmp_path)
+    full_disk("checkpoint.npz", 1000, "data/train_expert.py", *TRAINING, "--out", "a", cwd=tmp_path)
 
 
 def test_experiments(tmp_path):
     pytest.importorskip("joblib")
-    command = ["sweep", *SMALL, "--set", *SET]
+    command = [*SWEEP, *SET]
     full_disk("sweep.csv", 20, "data/experiments.py", *command, cwd=tmp_path)
     assert experiments.read_rows(tmp_path / "sweep.csv") == []
     succeeded(launch([ROOT / "data" / "experiments.py", *command], tmp_path))
     assert len(experiments.finished(experiments.read_rows(tmp_path / "sweep.csv"))) == 1
 
 
-def test_import_expert(tmp_path):
-    model = write_state(tmp_path / "model.pt", weights())
-    full_disk("expert.npz", 1000, "data/import_expert.py", model, "--task", "reacher-hard",
-              "--out", "mine", cwd=tmp_path)
+def test_import_expert(tmp_path, files):
+    full_disk("expert.npz", 1000, "data/import_expert.py", files / "expert.npz", "--task",
+              "reacher-hard", "--out", "mine", cwd=tmp_path)
     assert not (tmp_path / "mine" / "expert.npz").exists()
 
 

@@ -8,32 +8,12 @@ import numpy as np
 import pytest
 
 import fac_tdmpc_ref as fac
-from export_golden import digest
 from numpy_learner import ExpertConfig
-from test_layers import UNSEEN
-
-TASKS = sorted(p.parent.name for p in fac.EXPERTS.glob("*/golden.npz"))
-FORWARD, GRADIENT, ADAM = 1e-5, 1e-4, 1e-5  # relative to the largest entry, or to the norm
+from toys import (ADAM, FORWARD, GOLDEN, GRADIENT, NARROW, UNSEEN, assert_digest, narrow_expert,
+                  present, relative)
 
 
-def present(config_class, values):
-    """Those settings of a golden file's header that still exist."""
-    names = {f.name for f in fac.dataclasses.fields(config_class)}
-    values = {{"temperature": "inverse_temperature"}.get(k, k): v for k, v in values.items()}
-    return {k: v for k, v in values.items() if k in names}
-
-
-def relative(found, expected):
-    return float(np.abs(found - expected).max() / np.abs(expected).max())
-
-
-def assert_digest(array, expected, tolerance, size=None):
-    """Norm, product with a fixed unit vector and 64 entries, all relative to the norm or `size`."""
-    error = np.abs(digest(array) - expected).max() / (size or expected[0])
-    assert error <= tolerance, error
-
-
-@pytest.fixture(scope="module", params=TASKS)
+@pytest.fixture(scope="module", params=GOLDEN)
 def golden(request):
     folder = fac.EXPERTS / request.param
     model, _ = fac.load_model(folder / "expert.npz")
@@ -42,7 +22,7 @@ def golden(request):
 
 
 def test_there_is_an_expert():
-    assert "reacher-hard" in TASKS
+    assert "reacher-hard" in GOLDEN
 
 
 def test_expert_forward(golden):
@@ -143,8 +123,6 @@ def test_ten_adam_steps(golden, dtype):
 
 # ------------------------------------------------------- the narrow networks, in full
 
-NARROW = fac.EXPERTS / "golden-narrow.npz"
-
 
 def narrow_case(tag, dtype):
     header, arrays = fac.read_npz(NARROW, ("golden",))
@@ -179,16 +157,8 @@ def test_narrow_students(n, kind, dtype):
             assert relative(found, g[f"adam {key}"]) < ADAM, key
 
 
-def narrow_expert(header, g, prefix):
-    """The centralized model whose weights the narrow file keeps under a prefix."""
-    training = header["training"]
-    sizes = fac.ModelConfig(7, 6, 1, *(training[k] for k in ("latent_dim", "enc_dim", "mlp_dim")))
-    return fac.WorldModel(sizes, {
-        k[len(prefix):]: v[None, :, None] if v.ndim == 1 else v[None]
-        for k, v in g.items() if k.startswith(prefix)})
-
-
 # ------------------------------------------------------- PyTorch itself, on the same inputs
+
 
 @pytest.fixture
 def export_golden():

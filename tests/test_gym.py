@@ -12,10 +12,8 @@ import fac_tdmpc_ref as fac
 import import_expert
 import multitask
 import train_expert
-from test_cli import (
-    BLOCKED, ONE_THREAD, ROOT, SCRIPT, last_json, launch, refused, succeeded, write_expert)
-from test_equation1 import small_batch, small_learner
-from test_layers import assert_close
+from toys import (BLOCKED, EQUATION_1, ONE_THREAD, ROOT, SCRIPT, assert_close, last_json, launch,
+                  refused, small_batch, small_learner, succeeded, write_expert)
 
 pytest.importorskip("gymnasium")
 WALK, STROLL = "gym:gym_toys:Walk-v0", "gym:gym_toys:Stroll-v0"
@@ -180,11 +178,10 @@ def test_two_decisions_by_hand():
 @pytest.mark.parametrize("dtype, tolerance", [(np.float64, 1e-9), (np.float32, 2e-3)])
 def test_updates_beyond_an_end_are_pytorch_s(dtype, tolerance):
     pytest.importorskip("torch")
-    from test_equation1 import CONFIG
     from torch_learner import TorchLearner, torch
     ours = small_learner(np.random.default_rng(3), dtype)
     theirs = TorchLearner(fac.WorldModel(ours.model.config, {
-        k: v.copy() for k, v in ours.model.params.items()}), CONFIG, "cpu")
+        k: v.copy() for k, v in ours.model.params.items()}), EQUATION_1, "cpu")
     for key, value in ours.target.params.items():
         theirs.target[key].copy_(torch.tensor(value))
     for t in range(5):

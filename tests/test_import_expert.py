@@ -21,8 +21,7 @@ import pytest
 
 import fac_tdmpc_ref as fac
 import import_expert
-from test_data import refusal
-from test_planning import random_model
+from toys import random_model, refusal
 
 MIB = 1 << 20
 TASK, SIZES = "reacher-easy", fac.ModelConfig(8, 3, 1, 4, 5, 6)
@@ -40,6 +39,7 @@ def weights(seed=0, sizes=SIZES, policy=True, dtype=np.float32):
 
 
 # --------------------------------------------------------- a .pt by hand, without PyTorch
+
 
 def text(value):
     return b"X" + struct.pack("<I", len(value.encode())) + value.encode()
@@ -124,6 +124,7 @@ def untouched(tmp_path):
 
 
 # ------------------------------------------------------------------------------ what is read
+
 
 @pytest.mark.parametrize("dtype", ["<f8", "<f4", "<f2"])
 @pytest.mark.parametrize("nested", [True, False])
@@ -342,6 +343,7 @@ def write_safetensors(path, state):
 
 # --------------------------------------------------------------------------- what is refused
 
+
 def changed(change):
     state = weights()
     change(state)
@@ -466,6 +468,7 @@ def test_the_command_line_refuses_in_one_line_and_writes_nothing(tmp_path, capsy
 
 
 # --------------------------------------------------------------------------------- hostile
+
 
 class Calls:
     """Pickles as a call."""
@@ -729,6 +732,7 @@ def test_odd_names_in_messages_are_escaped(tmp_path):
 
 # -------------------------------------------------------------------------------------- fuzz
 
+
 def mutate(rng, data):
     """Flips, cuts, insertions, repetitions and interesting numbers, one to a few of them."""
     data = bytearray(data)
@@ -834,6 +838,7 @@ def test_fuzz(tmp_path, kind, capsys, pytestconfig):
 
 
 # ------------------------------------------------------------------------------- the replay
+
 
 def replay_arrays(episodes=20, rows=7, dtype=np.float64):
     rng, n = np.random.default_rng(2), episodes * rows

@@ -9,31 +9,9 @@ from hypothesis import strategies as st
 
 import fac_tdmpc_ref as fac
 from numpy_learner import ExpertConfig
-
-# A softmax doesn't see a constant, so these have no gradient but rounding errors, and Adam lets
-# them wander. Planning doesn't see a constant either.
-UNSEEN = ("_reward.4.bias", "_Q1.5.bias", "_Q2.5.bias")
+from toys import UNSEEN, assert_close, numeric_gradient
 
 SHAPES = [(1, 5, 4, 1), (1, 3, 7, 6), (3, 4, 5, 2), (2, 6, 3, 1)]  # N, in, out, B
-
-
-def numeric_gradient(function, x, step=1e-6):
-    """Central differences of a scalar function of the array x (changed in place and back)."""
-    gradient = np.zeros_like(x)
-    for i in np.ndindex(x.shape):
-        kept = x[i]
-        x[i] = kept + step
-        above = function()
-        x[i] = kept - step
-        below = function()
-        x[i] = kept
-        gradient[i] = (above - below) / (2 * step)
-    return gradient
-
-
-def assert_close(found, expected, tolerance=1e-7):
-    scale = max(np.abs(expected).max(), 1e-3)
-    assert np.abs(found - expected).max() <= tolerance * scale, np.abs(found - expected).max()
 
 
 @pytest.mark.parametrize("n, inputs, outputs, batch", SHAPES)
@@ -296,6 +274,7 @@ def test_flatten_gives_views():
 
 
 # ------------------------------------------------------------------------- live PyTorch
+
 
 @settings(max_examples=15, deadline=None)
 @given(st.sampled_from([1, 2, 3, 6]), st.integers(1, 4), st.integers(1, 4),

@@ -18,18 +18,17 @@ import experiments
 import fac_tdmpc_ref as fac
 import latents
 import multitask
-import test_cli
+import toys
 from multitask_model import SCALES, TASKS, Multitask, MultitaskDistiller, load
-from test_cli import ONE_THREAD, ROOT, last_json, launch, succeeded, write_expert, write_replay
-from test_layers import assert_close, numeric_gradient
+from toys import (ONE_THREAD, ROBOTS, ROOT, assert_close, last_json, launch, numeric_gradient,
+                  succeeded, write_expert, write_replay)
 
 SCRIPT = ROOT / "data" / "multitask.py"
-ROBOTS = {"reacher-hard": (8, 3), "hopper-hop": (15, 4), "walker-walk": (24, 6)}
 CONFIG = fac.DistillConfig(steps=40, batch_size=12, warmup=4, expert_episodes=0, held_out=0.34,
                            horizon=2, encoder_input="observation")
 TINY = ["--batch-size", "12", "--horizon", "1", "--held-out", "0.34", "--warmup", "2",
         "--expert-episodes", "0"]
-refused = functools.partial(test_cli.refused, program="multitask.py")
+refused = functools.partial(toys.refused, program="multitask.py")
 
 
 @pytest.fixture(scope="module")
@@ -325,7 +324,7 @@ def test_evaluate(data, student, short_episodes):
 
 
 def test_help_is_quick(tmp_path):
-    watched = test_cli.WATCHED.replace(
+    watched = toys.WATCHED.replace(
         f"sys.path.insert(0, {str(ROOT)!r})", f"sys.path.insert(0, {str(ROOT / 'data')!r})"
     ).replace("import fac_tdmpc_ref as fac", "import multitask as fac")
     for command in ([], ["distill"], ["evaluate"]):

@@ -13,15 +13,7 @@ import numpy as np
 import pytest
 
 import fac_tdmpc_ref as fac
-
-
-def random_model(n=3, dim_action=3, latent=6, hidden=24, seed=0, policy=False):
-    sizes = fac.ModelConfig(8, dim_action, n, latent, 16, hidden)
-    rng = np.random.default_rng(seed)
-    model = fac.WorldModel.create(sizes, rng, policy)
-    for value in model.params.values():
-        value += 0.3 * rng.standard_normal(value.shape, np.float32)
-    return model
+from toys import random_model, student_of
 
 
 def streams(n, seed=0):
@@ -272,19 +264,6 @@ def test_noisy_actions_of_a_policy_are_clipped():
     assert np.abs(fac.policy_rollout(model, z, [np.float32(2)] * 3)).max() == 1
 
 
-def student_of(expert, agents=3, prior_steps=4, **sizes):
-    """A student that reads the expert's latent and has priors, its own weights alive."""
-    sizes = {"latent_dim": 6, "mlp_dim": 24, **sizes}
-    config = fac.dataclasses.replace(fac.student_config(expert.config, agents, "latent",
-                                                        prior_steps), **sizes)
-    student = fac.new_student(expert, config, 0)[1]
-    rng = np.random.default_rng(3)
-    for key, value in student.params.items():
-        if not key.startswith("_expert"):
-            value += 0.3 * rng.standard_normal(value.shape, np.float32)
-    return student
-
-
 def written_out(student, obs):
     """What a student's priors say, network by network, (N, L, d), of an observation (O,)."""
     p, sizes = student.params, student.config
@@ -434,6 +413,7 @@ def test_planner_config_refuses_nonsense():
 
 
 # ------------------------------------------------------------------------------- workers
+
 
 def shared_memory():
     """What multiprocessing has made there; others' come and go."""
@@ -605,9 +585,8 @@ def test_an_interrupted_decision_ends_the_workers(monkeypatch):
 # how a script of its own process begins
 IMPORTS = f"""
 import sys
-sys.path[:0] = [{str(fac.DATA.parent)!r}, {os.path.dirname(os.path.abspath(__file__))!r}]
-import fac_tdmpc_ref as fac
-from test_planning import random_model
+sys.path[:0] = [{os.path.dirname(os.path.abspath(__file__))!r}]
+from toys import fac, random_model
 """
 SCRIPT = """
 import signal, time

@@ -6,19 +6,11 @@ import numpy as np
 import pytest
 
 import fac_tdmpc_ref as fac
-from test_agents import Robot
-from test_distill import CONFIG, distilled, write_replay
-from test_layers import assert_close, numeric_gradient
-from test_planning import random_model, student_of
+from toys import CONFIG, Joints, assert_close, distilled, numeric_gradient, random_model, student_of
 
 
-@pytest.fixture(scope="module")
-def replay(tmp_path_factory):
-    return write_replay(tmp_path_factory.mktemp("replay") / "replay.npz")
-
-
-class Toy(Robot):
-    """`Robot` with three joints."""
+class Toy(Joints):
+    """`Joints` with three joints."""
 
     def step(self, action):
         self.state = 0.9 * self.state + 0.3 * np.r_[action, np.cumsum(action), action[:2]]
@@ -26,6 +18,7 @@ class Toy(Robot):
 
 
 # prior_loss ---------------------------------------------------------------------------
+
 
 def loss_case(n, d=2, steps=3, batch=4, seed=0):
     """A float64 student whose agents have d actions, what its encoders read, and targets."""
@@ -110,6 +103,7 @@ def test_agents_learn_their_own_part_of_the_plan_alone():
 
 
 # learning -----------------------------------------------------------------------------
+
 
 def test_algorithm_1_and_the_priors_leave_each_other_s_weights_alone(replay):
     """All of them learned by one student; the expert's are nobody's."""
@@ -274,6 +268,7 @@ def test_priors_that_diverge_stop(replay):
 
 
 # playing ------------------------------------------------------------------------------
+
 
 @pytest.mark.parametrize("teacher", [
     {"samples": 16, "iterations": 2, "max_std": 0.5}, {"prior": "last", "samples": 8},

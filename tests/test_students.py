@@ -6,7 +6,7 @@ import pytest
 
 import fac_tdmpc_ref as fac
 import students
-from test_planning import random_model
+from toys import random_model
 
 
 @pytest.mark.parametrize("cores, seconds, workers, best", [

@@ -11,10 +11,7 @@ import fac_tdmpc_ref as fac
 import import_expert
 import multitask
 import tdmpc2
-from test_cli import write_replay
-from test_data import refusal
-from test_layers import assert_close, numeric_gradient
-from test_multitask import ROBOTS
+from toys import ROBOTS, assert_close, numeric_gradient, refusal, write_replay
 
 NAMES = ["walker-walk", "-", "hopper-hop", "reacher-hard"]
 TASK, WIDE, M, E, A = "hopper-hop", 24, 16, 7, 6  # a robot that isn't the widest; model's sizes

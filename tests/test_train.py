@@ -15,20 +15,14 @@ import pytest
 import fac_tdmpc_ref as fac
 import own_robot
 import train_expert
-from test_cli import ONE_THREAD, ROOT, WATCHED, last_json, launch, refused, run, succeeded
-from test_distill import ramp
+from toys import (ONE_THREAD, ROOT, TRAINING, WATCHED, last_json, launch, ramp, refused, run,
+                  succeeded)
 
 SCRIPT = ROOT / "data" / "train_expert.py"
 
-TINY = ["--task", "reacher-easy", "--steps", "3000", "--envs", "2", "--seed-decisions", "1000",
-        "--updates-per-step", "0.01", "--batch-size", "8", "--mlp-dim", "16", "--enc-dim", "8",
-        "--latent-dim", "6", "--plan-samples", "8", "--plan-iterations", "1", "--evaluate-every",
-        "2000", "--evaluate-episodes", "1", "--distill-batch-size", "8", "--student", "fac",
-        "--workers", "1", "--episodes", "0"]
-
 
 def train(*arguments, cwd):
-    return launch([SCRIPT, *TINY, *arguments], cwd)
+    return launch([SCRIPT, *TRAINING, *arguments], cwd)
 
 
 def episode(rng, value):
@@ -271,7 +265,7 @@ def test_an_online_student_s_own_actions_begin_where_their_state_is(monkeypatch)
 
 def training(*more):
     """A Training that has done nothing yet."""
-    args = train_expert.make_parser().parse_args([*TINY, *more])
+    args = train_expert.make_parser().parse_args([*TRAINING, *more])
     return train_expert.Training(args, *train_expert.read_settings(args))
 
 
@@ -459,7 +453,7 @@ def test_a_killed_run_goes_on_to_the_same_result(trained, tmp_path):
     out = tmp_path / "killed"
     stopped = train("--minutes", "1e-9", "--out", out, "--json", cwd=tmp_path)
     assert last_json(stopped)["done"] is False and "goes on" in stopped.stderr
-    process = subprocess.Popen([sys.executable, SCRIPT, *TINY, "--out", out],
+    process = subprocess.Popen([sys.executable, SCRIPT, *TRAINING, "--out", out],
                                stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     deadline = time.time() + 100
     while len((out / "curve.csv").read_text().splitlines()) < 2 and time.time() < deadline:
@@ -548,7 +542,7 @@ def test_the_lag_is_counted_from_the_expert_s_crossing():
 
 # the two learners, and acting for them ------------------------------------------------
 
-SMALL = [*TINY[:TINY.index("--student")], "--workers", "1", "--episodes", "0"]
+SMALL = [*TRAINING[:TRAINING.index("--student")], "--workers", "1", "--episodes", "0"]
 
 
 def trained_here(capsys, *arguments):
