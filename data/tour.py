@@ -493,10 +493,9 @@ def draw(path, name, found):
 TEXT = """\
 # The method in pictures
 
-`python data/tour.py` made this page: it distils two students of the 3-link arm (reacher-hard),
-{steps} steps each, and looks into them. Its numbers are of one short run of small networks: how
-learning begins; the [README](../README.md) says how it ends. Read Part I of `fac_tdmpc_ref.py`
-beside it. Agent i is joint i, counted from 0 as in Figure 9.
+`python data/tour.py` made this page: it distils two small students of the 3-link arm
+(reacher-hard), {steps} steps each, and shows how learning begins; the [README](../README.md) says
+how it ends. Read it beside Part I of `fac_tdmpc_ref.py`. Joints count from 0, as in Figure 9.
 
 ## 1. Layers and the agent axis
 
@@ -504,10 +503,10 @@ beside it. Agent i is joint i, counted from 0 as in Figure 9.
 of weights.](figures/tour-1-layers.png)
 
 A layer's weights are one array (N, out, in); `linear` multiplies each agent's matrix with that
-agent's input. The expert has N = 1: every output reads the whole latent s and all actions. The
-student has N = 3. As one matrix, its layer has three blocks; white means no weights. So the next
-s^i depends on s^i and a^i alone; f_R^i and f_Q^i are built alike. Only the encoder f_E
-(`WorldModel.encode`) is shared; its output is cut into s^0, s^1, s^2.
+agent's input. The expert, N = 1, reads the whole latent s and all actions for every output. The
+student, N = 3, has three blocks; white means no weights. So the next s^i depends on s^i and a^i
+alone; f_R^i and f_Q^i are built alike. Only the encoder f_E (`WorldModel.encode`) is shared; its
+output is cut into s^0, s^1, s^2.
 
 ## 2. One trajectory and its copies
 
@@ -516,10 +515,10 @@ softmax.](figures/tour-2-copies.png)
 
 Take a recorded observation g and the {L} actions that followed. `perturbed_actions` makes {K}
 copies with noise; here copy 0 stays as it was. `unroll` rolls the expert's latent out under each
-copy; `predict` gives reward and Q at every step h. Which copy is better is all that a planner
-needs. The softmax keeps that: all Q_{H} are near {level}, which it forgets; copy {k_best}, the
-best, gets {p_best}, copy {k_worst}, the worst, {p_worst}. This is the expert's half of Equation
-4. (Drawn: the most typical of {states} held-out trajectories.)
+copy; `predict` gives reward and Q at every step h. A planner needs the copies' order. The
+softmax, p_k = exp(Q_k / T) divided by its sum over k, keeps it: all Q_{H} are near {level}, which
+it forgets; copy {k_best}, the best, gets {p_best}, copy {k_worst}, the worst, {p_worst}. This is
+the expert's half of Equation 4. (Drawn: the most typical of {states} held-out trajectories.)
 
 ## 3. The student learns
 
@@ -527,15 +526,15 @@ best, gets {p_best}, copy {k_worst}, the worst, {p_worst}. This is the expert's 
 divergence.](figures/tour-3-softmax.png)
 
 The student predicts the same copies. `soft_kl` says how far its softmax p^s is from the expert's
-p^e: D is the sum over k of p^e_k log(p^e_k / p^s_k), 0 only where both agree. To a fresh student,
-whose last layers are zero, all copies seem alike. `distill_loss` adds up D of R_h and Q_h, with
-weights lambda^h; `distill` follows its gradient. In held-out trajectories D of Q_0 falls from
-{D0_before} to {D0_after}, of Q_{H}, after more noise, from {DH_before} to {DH_after}. The
-rewards' D is small already: this arm is rewarded at its target only.
+p^e: D is the sum over k of p^e_k log(p^e_k / p^s_k), 0 only where both agree. A fresh student's
+last layers are zero: all copies seem alike. `distill_loss` adds up D of R_h and Q_h, with weights
+lambda^h; `distill`, Algorithm 1, follows its gradient. On held-out trajectories D of Q_0 falls
+from {D0_before} to {D0_after}, of Q_{H} from {DH_before} to {DH_after}. The rewards' D is small
+already: this arm is rewarded at its target only.
 
 ## 4. Sums of shares
 
-![Bars: each joint's share of a reward and a Q, for each copy. Dots: their sum. Diamonds: the
+![Bars: shares of a reward and a Q, for each copy. Dots: their sum. Diamonds: the
 expert's.](figures/tour-4-shares.png)
 
 `run_heads` returns each joint's share; `predict` adds them up. Equation 4 sees only the sum's
@@ -551,20 +550,21 @@ gained.](figures/tour-5-mppi.png)
 iteration draws {samples} sequences around a mean, keeps {elites} elites, the best, and moves mean
 and width to these. Both search the same student. With N = 1 one agent ranks sequences of all
 joints by G: a poor action of joint 0 survives where its neighbours were lucky. With N = 3 each
-joint ranks its own by G_i, and narrows faster. Over 32 states this gains {gain_all} above doing
-nothing, N = 1 {gain_one}: {gap} less.
+joint ranks its own by G_i, and narrows faster. Over 32 states its plans gain {gain_all} above
+doing nothing; N = 1 gains {gap} less.
 
 ## 6. Proposition 1
 
-![Maps of G over sequences of joints 0 and 1: all rows of the student's have one best column.
-Right: each G_i.](figures/tour-6-grid.png)
+![Maps of G over sequences of joints 0 and 1, with each row's best column. Right: each
+G_i.](figures/tour-6-grid.png)
 
-Let each joint choose among {P} sequences of -1 and +1 (0: always -1, {P_last}: always +1); try
-all {combinations} combinations. The student's best is ({best}): the best of each joint's own G_i,
-found in {each} evaluations. For G is the sum of the G_i, and G_0 depends on joint 0's actions
-alone. Whatever the others do, its best stays its best: the dots form a line. This is Equation 3.
-The expert's dots visit {columns} columns: there, joint 0's best depends on joint 1. By the
-expert's G the student's best is only number {rank}: Proposition 1 speaks of the student's own.
+Let each joint choose among {P} sequences of -1 and +1 (0: always -1, {P_last}: always +1; in the
+maps joint 2 has its best); try all {combinations} combinations. The student's best is ({best}):
+the best of each joint's own G_i, found in {each} evaluations. For G is the sum of the G_i, and
+G_0 depends on joint 0's actions alone. Whatever the others do, its best stays its best: the dots
+form a line. This is Equation 3: argmax G is (argmax G_0, argmax G_1, argmax G_2). The expert's
+dots visit {columns} columns: there, joint 0's best depends on joint 1. By the expert's G the
+student's best is only number {rank}: Proposition 1 speaks of the student's own.
 
 ## 7. Credit: what each joint did
 
@@ -584,8 +584,7 @@ student's by {r_joint}.
 
 `AgentPlanner.plan` runs f_T, f_R and f_Q for every sample. In the same search the student's take
 {part_student}% of the expert's multiply-adds, one joint's {part_joint}%: with a processor for
-each joint, a decision waits for no more. Default students are wider, but most act without a
-search, by priors.
+each joint, a decision waits for no more. Most default students act without a search, by priors.
 """
 
 
@@ -597,7 +596,7 @@ def facts(found, config):
     rows = G[(..., *grid["expert"]["best"][2:])].T  # as drawn
     part = {name: f"{100 * row['multiply-adds'] / cost['expert']['multiply-adds']:.1f}"
             for name, row in cost.items()}
-    one, all_ = (np.array(row["gains"])[:, -1] for row in mppi.values())
+    one, each = (np.array(row["gains"])[:, -1] for row in mppi.values())
     return {
         "steps": f"{config.steps:,}", "states": STATES, "L": len(copies["p"]), "K": len(p),
         "H": config.horizon,
@@ -607,8 +606,8 @@ def facts(found, config):
         "DH_before": f"{before[-1]:.2f}", "DH_after": f"{after[-1]:.2f}",
         "r_Q": f"{shares['Q']['r']:.2f}", "r_R": f"{shares['reward']['r']:.2f}",
         "h_R": shares["reward"]["h"], "samples": SEARCH.samples, "elites": SEARCH.num_elites,
-        "gain_one": f"{one.mean():.2f}", "gain_all": f"{all_.mean():.2f}",
-        "gap": f"{(all_ - one).mean():.2f} ± {(all_ - one).std(ddof=1) / len(one) ** 0.5:.2f}",
+        "gain_all": f"{each.mean():.2f}",
+        "gap": f"{(each - one).mean():.2f} ± {(each - one).std(ddof=1) / len(one) ** 0.5:.2f}",
         "P": len(G), "P_last": len(G) - 1, "combinations": f"{G.size:,}", "each": grid["G_i"].size,
         "best": ", ".join(map(str, best)), "columns": len(set(rows.argmax(1))),
         "rank": f"{1 + (G > G[tuple(best)]).sum():,}",
