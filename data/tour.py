@@ -26,7 +26,7 @@ CONFIG = fac.DistillConfig(steps=1200, lr=3e-3, warmup=50, targets="joint", expe
                            played_share=0, priors=False)
 SIZES = {"mlp_dim": 64, "latent_dim": 24}  # small enough for a minute
 SEARCH = fac.PlannerConfig(samples=64, output="mean")  # of picture 5
-JOINTS = ("#0072b2", ""), ("#d55e00", "///"), ("#009e73", "...")  # colour and hatch of each
+JOINTS = ("#0072b2", ""), ("#e69f00", "///"), ("#b8e3d5", "...")  # dark to light; hatches
 INK, GREY = "#333333", "#bbbbbb"
 
 
@@ -286,7 +286,7 @@ def draw_layers(figure, found):
              xticklabels=["$s, a$"])
     for i, (color, _) in enumerate(JOINTS[:n]):
         middle.text((i + 0.5) * columns, (i + 0.5) * rows, f"joint {i}", ha="center", va="center",
-                    color=color, bbox={"facecolor": "white", "edgecolor": color})
+                    bbox={"facecolor": "white", "edgecolor": color})
     middle.set(xticks=[(i + 0.5) * columns for i in range(n)], yticks=[],
                xticklabels=[f"$s^{i}, a^{i}$" for i in range(n)])
     places = np.arange(len(found["student weights"]))
@@ -320,7 +320,6 @@ def draw_copies(figure, found):
     for k, bars in enumerate(right.containers):
         right.bar_label(bars, [k] * len(found["p"]), fontsize=7)
     right.set(title="its softmax over the copies, 0 to 4", xlabel="h")
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=K)
 
 
 def draw_lines(ax, values):
@@ -358,7 +357,6 @@ def draw_softmax(figure, found):
         draw_bars(ax, {label: found[f"{models[label]} D"][i] for label in [*models][:2]}, styles,
                   [found[f"{models[label]} error"][i] for label in [*models][:2]])
         ax.set(title=f"divergence of ${name}_h$, mean of {STATES}", xlabel="h")
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
 
 def draw_shares(figure, found):
@@ -368,7 +366,6 @@ def draw_shares(figure, found):
                   JOINTS)
         draw_sums(ax, {"their sum": row["sum"], "expert": row["expert"]})
         ax.set(title=f"${name[0].upper()}_{row['h']}$ less its mean over copies", xlabel="copy")
-    figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=5)
 
 
 def draw_sums(ax, series):
@@ -395,7 +392,6 @@ def draw_mppi(figure, found):
         right.plot(times, np.mean(row["gains"], 0), style, label=f"N = {agents}",
                    color=JOINTS[0][0] if agents > 1 else INK)
     axes[0].set_ylabel("first action of joint 0")
-    axes[0].legend(fontsize=8)
     right.set(title="gain in G, mean", xlabel="iteration", xticks=times)
     right.legend()
 
@@ -415,13 +411,12 @@ def draw_grid(figure, found):
         ax.set(title=f"G of the {key}", xlabel="sequence of joint 0", ylabel="sequence of joint 1")
     for i, (own, (color, _)) in enumerate(zip(found["G_i"], JOINTS)):
         own = own - own.min()
-        axes[2].plot(own, marker="os^"[i], color=color, markersize=4, label=f"joint {i}",
-                     linestyle=("-", "--", ":")[i])
+        axes[2].plot(own, marker="os^"[i], color=INK, markerfacecolor=color, markersize=6,
+                     linestyle=("-", "--", ":")[i], label=f"joint {i}")
         axes[2].plot(found["each"][i], own.max(), "*", color="white", markeredgecolor="black",
                      markersize=15)
     axes[2].set(title="$G_i$ less its least", xlabel="its own sequence")
     axes[2].legend(fontsize=8)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
 
 def draw_credit(figure, found):
@@ -438,7 +433,6 @@ def draw_credit(figure, found):
               [("white", ""), ("#56b4e9", "///")])
     right.set(title="correlation", xlabel="joint", ylim=(None, 1.25))
     right.legend(fontsize=8)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
 
 
 def draw_cost(figure, found):
@@ -457,7 +451,6 @@ def draw_cost(figure, found):
            xlabel=f"time of a decision, the expert's = 1; {processor()}, one thread")
     ax.invert_yaxis()
     ax.grid(False, axis="y")
-    ax.legend(loc="lower right")
 
 
 def processor():
@@ -478,8 +471,12 @@ PICTURES = {  # name: numbers, drawing, height in inches
 
 def draw(path, name, found):
     """One of PICTURES as a file of 128 colours."""
-    figure = plots.pyplot().figure(figsize=(8.2, PICTURES[name][2]), layout="constrained")
-    PICTURES[name][1](figure, found)
+    _, picture, height = PICTURES[name]
+    figure = plots.pyplot().figure(figsize=(8.2, height), layout="constrained")
+    picture(figure, found)
+    handles = figure.axes[0].get_legend_handles_labels()
+    if handles[0]:
+        figure.legend(*handles, loc="outside lower center", ncols=6)
     plots.save_figure(path, figure)
     from PIL import Image  # matplotlib's
     with Image.open(path) as image:
