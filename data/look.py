@@ -67,7 +67,7 @@ def draw_plan(draw, left, ranges, plan):
     height, width = PIXELS / len(plan), BARS / (len(ranges) + 1)
     for j, planned in enumerate(plan):
         middle, bars = (j + 0.5) * height, [*ranges[:, j], (planned, planned)]
-        draw.line((left, middle, left + BARS, middle), fill="#dddddd")
+        draw.line((left, middle, left + BARS, middle), fill="#999999")
         for i, (low, high) in enumerate(bars):
             top, bottom = (middle - 0.4 * height * action for action in (high, low))
             is_plan = i == len(ranges)
@@ -127,7 +127,8 @@ def command_watch(args):
             imageio.mimwrite(file, [np.asarray(image) for image in images], format="mp4",
                              fps=1 / seconds, macro_block_size=2)
         else:
-            images = [image.quantize(64) for image in images]
+            few = images[0].quantize(24)  # one palette for all, or files are twice as large
+            images = [image.quantize(palette=few, dither=0) for image in images]
             images[0].save(file, format="gif", save_all=True, append_images=images[1:], loop=0,
                            duration=int(1e3 * seconds))
     result = {"out": args.out, "frames": len(images), "bytes": Path(args.out).stat().st_size,
