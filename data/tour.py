@@ -492,7 +492,8 @@ TEXT = """\
 
 `python data/tour.py` made this page: it distils two small students of the 3-link arm
 (reacher-hard), {steps} steps each, and shows how learning begins; the [README](../README.md) says
-how it ends. Read it beside Part I of `fac_tdmpc_ref.py`. Joints count from 0, as in Figure 9.
+how it ends. Read it beside Part I of `fac_tdmpc_ref.py`. Joints count from 0, as in the paper's
+Figure 9.
 
 ## 1. Layers and the agent axis
 
@@ -544,8 +545,8 @@ all trajectories they correlate with the expert's by {r_Q} for Q_{H}, {r_R} for 
 gained.](figures/tour-5-mppi.png)
 
 `h_step_return` is Equation 2: H rewards, then Q. `mppi` looks for actions that make it large. An
-iteration draws {samples} sequences around a mean, keeps {elites} elites, the best, and moves mean
-and width to these. Both search the same student. With N = 1 one agent ranks sequences of all
+iteration draws {samples} sequences around a mean, keeps the best {elites} (elites), and moves
+mean and width to these. Both use the same student. With N = 1 one agent ranks sequences of all
 joints by G: a poor action of joint 0 survives where its neighbours were lucky. With N = 3 each
 joint ranks its own by G_i, and narrows faster. Over 32 states its plans gain {gain_all} above
 doing nothing; N = 1 gains {gap} less.
@@ -560,8 +561,8 @@ maps joint 2 has its best); try all {combinations} combinations. The student's b
 the best of each joint's own G_i, found in {each} evaluations. For G is the sum of the G_i, and
 G_0 depends on joint 0's actions alone. Whatever the others do, its best stays its best: the dots
 form a line. This is Equation 3: argmax G is (argmax G_0, argmax G_1, argmax G_2). The expert's
-dots visit {columns} columns: there, joint 0's best depends on joint 1. By the expert's G the
-student's best is only number {rank}: Proposition 1 speaks of the student's own.
+dots visit {columns} columns: joint 0's best depends on joint 1. By the expert's G the student's
+best is number {rank}: Proposition 1 speaks of the student's own.
 
 ## 7. Credit: what each joint did
 
@@ -634,7 +635,7 @@ def command_tour(args):
     for name, path in paths.items():
         draw(path, name, found[name])
     known = facts(found, config)
-    with fac.atomic_file(out / "tour.md", "w") as file:
+    with fac.atomic_file(out / "tour.md", "w", encoding="utf-8") as file:
         file.write(filled(known))
     seconds = time.monotonic() - begin
     print(f"{out / 'tour.md'}: {len(paths)} pictures in {out / 'figures'}, {seconds:.0f} s")

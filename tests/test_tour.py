@@ -199,7 +199,7 @@ def test_the_command_writes_page_and_pictures(scene, data, tmp_path, monkeypatch
                                                 "--json"]) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert len(result["bytes"]) == 8 and max(result["bytes"].values()) <= 60_000
-    page = (tmp_path / "tour.md").read_text()
+    page = (tmp_path / "tour.md").read_text("utf-8")
     assert pictures(page) == sorted(f"figures/{p.name}" for p in tmp_path.glob("figures/*"))
     with fac.one_thread():  # again: the same numbers
         known = {name: numbers(scene) for name, (numbers, *_) in tour.PICTURES.items()}
@@ -228,12 +228,12 @@ def test_the_page_is_the_template_s():
     parts = re.split(r"\{\w+\}", " ".join(tour.TEXT.split()))
     known = r"[-\d.,]+(?: ± [\d.]+|(?:, -?[\d.]+)*)"
     pattern = known.join(map(re.escape, parts))
-    assert re.fullmatch(pattern, " ".join(PAGE.read_text().split()))
-    assert f"{tour.CONFIG.steps:,} steps" in PAGE.read_text()
+    assert re.fullmatch(pattern, " ".join(PAGE.read_text("utf-8").split()))
+    assert f"{tour.CONFIG.steps:,} steps" in PAGE.read_text("utf-8")
 
 
 def test_the_page_is_short_and_its_names_exist():
-    page = PAGE.read_text()
+    page = PAGE.read_text("utf-8")
     assert len(page.split()) <= 900
     for name in re.findall(r"`([\w.]+)`", page):
         if not name.endswith(".py"):
@@ -245,7 +245,7 @@ def test_the_page_is_short_and_its_names_exist():
 
 
 def test_pictures_are_small_and_all_are_shown():
-    shown = pictures(PAGE.read_text())
+    shown = pictures(PAGE.read_text("utf-8"))
     assert shown == sorted(f"figures/{path.name}"
                            for path in PAGE.parent.glob("figures/tour-*.png")) and len(shown) == 8
     for path in shown:
