@@ -28,21 +28,26 @@ def choose_renderer():
                         "OSMesa (libosmesa6)")
 
 
-def shares(model, latents, config):
-    """What a plan that each agent makes anew from its latent is worth above doing nothing (N,)."""
-    n = model.config.num_agents
-    returns = functools.partial(fac.h_step_return, model, latents[:, :model.config.latent_dim],
-                                config=config)
-    nothing = np.zeros((n, config.horizon + 1, model.config.agent_actions), fac.F32)
-    first = model.prior(latents, config.horizon + 1)[..., 0] if config.prior == "own" else nothing
+def narrowing(model, latents, config):
+    """How each joint's plan, made anew, narrows: between which first actions the middle four fifths
+    of an iteration's samples are, (I, A, 2), and the plan's, (A,), in the robot's order."""
+    sizes, drawn = model.config, []
+
+    def returns(actions):
+        drawn.append(np.quantile(actions[:, 0], (0.1, 0.9), axis=2))
+        return fac.h_step_return(model, latents[:, :sizes.latent_dim], actions, config)
+
+    n, L, d = sizes.num_agents, config.horizon + 1, sizes.agent_actions
+    first = (model.prior(latents, L)[..., 0] if config.prior == "own" else
+             np.zeros((n, L, d), fac.F32))
     rngs = [np.random.default_rng(0) for _ in range(n)]
     plan = fac.mppi(returns, first, config, rngs)[0] if config.iterations else first
-    worth = returns(np.stack([plan, nothing], -1))
-    return worth[:, 0] - worth[:, 1]
+    order = np.argsort(np.arange(n * d)[fac.agent_order(sizes)])
+    return np.reshape(drawn, (-1, 2, n * d)).swapaxes(1, 2)[:, order], plan[:, 0].ravel()[order]
 
 
 def watch_episode(path, model, header, task, seed, decisions, every):
-    """Frames of a model's episode: picture, shares (N,) and return so far of each; its name, the
+    """Frames of a model's episode: picture, `narrowing` and return so far of each; its name, the
     median milliseconds of a decision, and the return in the end."""
     config = fac.PlannerConfig(**fac.made_for(header, path))
     environment = fac.Environment(task, config.action_repeat)
@@ -50,30 +55,38 @@ def watch_episode(path, model, header, task, seed, decisions, every):
     obs, actions, rewards, seconds = (x[0] for x in fac.play(
         model, task, config, [seed], label=f"playing {path}", environment=environment))
     pictures = frames_at(task, seed, actions, range(0, decisions, every), config.action_repeat)
-    frames = [(picture, shares(model, model.latents(obs[t][:, None]), config), rewards[:t].sum())
-              for t, picture in pictures.items()]
+    frames = [(picture, narrowing(model, model.latents(obs[t][:, None]), config),
+               rewards[:t].sum()) for t, picture in pictures.items()]
     name = f"{header['kind']}, N = {model.config.num_agents}"
     return frames, name, 1e3 * float(np.median(seconds)), float(rewards.sum())
 
 
+def draw_plan(draw, left, ranges, plan):
+    """A row for each joint, from -1 below to 1 above: grey what an iteration drew, one beside the
+    other, then blue the plan."""
+    height, width = PIXELS / len(plan), BARS / (len(ranges) + 1)
+    for j, planned in enumerate(plan):
+        middle, bars = (j + 0.5) * height, [*ranges[:, j], (planned, planned)]
+        draw.line((left, middle, left + BARS, middle), fill="#999999")
+        for i, (low, high) in enumerate(bars):
+            top, bottom = (middle - 0.4 * height * action for action in (high, low))
+            is_plan = i == len(ranges)
+            draw.rectangle((left + i * width + 1, top - 2 * is_plan, left + (i + 1) * width - 1,
+                            bottom + 2 * is_plan), fill="#1f77b4" if is_plan else "#999999")
+        draw.line((left, (j + 1) * height, left + BARS, (j + 1) * height), fill="black")
+
+
 def draw_frames(episodes):
-    """PIL images of episodes side by side, each with bars for its agents' shares."""
+    """PIL images of episodes side by side, each with its joints' plans."""
     from PIL import Image, ImageDraw
     width, images = PIXELS + BARS, []
-    largest = [max(np.abs(share).max() for _, share, _ in frames) + 1e-9
-               for frames, *_ in episodes]
     for columns in zip(*(frames for frames, *_ in episodes)):
         image = Image.new("RGB", (width * len(episodes), PIXELS + TEXT), "white")
         draw = ImageDraw.Draw(image)
-        for k, (picture, share, total) in enumerate(columns):
+        for k, (picture, plan, total) in enumerate(columns):
             left, (_, name, ms, _) = k * width, episodes[k]
             image.paste(Image.fromarray(picture), (left, 0))
-            height, middle = PIXELS / len(share), left + PIXELS + BARS / 2
-            for i, value in enumerate(share / largest[k] * (BARS / 2 - 4)):
-                draw.rectangle((min(middle, middle + value), (i + 0.15) * height,
-                                max(middle, middle + value), (i + 0.85) * height),
-                               fill="#1f77b4" if value > 0 else "#999999", outline="black")
-            draw.line((middle, 0, middle, PIXELS), fill="black")
+            draw_plan(draw, left + PIXELS, *plan)
             draw.text((left + 4, PIXELS + 4), f"{name}: {ms:.1f} ms a decision", fill="black")
             draw.text((left + 4, PIXELS + 18), f"return so far {total:.0f}", fill="black")
         images.append(image)
@@ -114,7 +127,8 @@ def command_watch(args):
             imageio.mimwrite(file, [np.asarray(image) for image in images], format="mp4",
                              fps=1 / seconds, macro_block_size=2)
         else:
-            images = [image.quantize(64) for image in images]
+            few = images[0].quantize(24)  # one palette for all, or files are twice as large
+            images = [image.quantize(palette=few, dither=0) for image in images]
             images[0].save(file, format="gif", save_all=True, append_images=images[1:], loop=0,
                            duration=int(1e3 * seconds))
     result = {"out": args.out, "frames": len(images), "bytes": Path(args.out).stat().st_size,
@@ -375,9 +389,10 @@ def add_commands(commands):
     """The three sub-commands' arguments."""
     positive = functools.partial(fac.natural, least=1)
     sub = fac.add_command(
-        commands, "watch", command_watch, "An episode as a moving picture: beside the robot a bar "
-        "for each agent, what a plan made anew is worth above doing nothing (each model has its "
-        "scale); below, a decision's time.")
+        commands, "watch", command_watch, "An episode as a moving picture: beside the robot "
+        "a row for each joint, where its first action is between -1 and 1: grey what a plan made "
+        "anew draws in each iteration (the middle four fifths), blue the plan; below, a "
+        "decision's time.")
     sub.add_argument("--model", required=True, help="an expert.npz or student.npz")
     sub.add_argument("--beside", help="another one, on the same episode")
     sub.add_argument("--task", help="one of: " + fac.TASK_NAMES + " [the model's own]")

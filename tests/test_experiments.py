@@ -1267,42 +1267,55 @@ def test_returns_of_other_versions_are_said_to_be_old(tmp_path, capsys):
 # watch --------------------------------------------------------------------------------
 
 
-def test_shares_are_each_agent_s_own():
-    """An agent alone plans and gains the same (Proposition 1), and more than nothing."""
+def test_a_joint_s_samples_narrow_to_its_plan():
+    """Which an agent alone makes as well (Proposition 1); rows are in the robot's order."""
     model, config = random_model(), fac.PlannerConfig(samples=64, horizon=2)
     latents = model.latents(np.random.default_rng(0).standard_normal((8, 1), np.float32))
-    found = look.shares(model, latents, config)
-    alone = [look.shares(fac.some_agents(model, i, i + 1), latents[i:i + 1], config)[0]
-             for i in range(3)]
-    assert found.shape == (3,) and (found > 0).all()
-    np.testing.assert_allclose(found, alone, rtol=1e-4)
+    ranges, plan = look.narrowing(model, latents, config)
+    assert ranges.shape == (4, 3, 2) and plan.shape == (3,)
+    wide = ranges[..., 1] - ranges[..., 0]
+    assert (wide[0] > 1.9).all() and (wide[3] < 0.5 * wide[0]).all()
+    assert ((ranges[3, :, 0] - 0.1 < plan) & (plan < ranges[3, :, 1] + 0.1)).all()
+    for i in range(3):
+        alone = look.narrowing(fac.some_agents(model, i, i + 1), latents[i:i + 1], config)
+        np.testing.assert_allclose(alone[0][:, 0], ranges[:, i], atol=1e-3)
+        np.testing.assert_allclose(alone[1], plan[i:i + 1], atol=1e-3)
+    model.config = dataclasses.replace(model.config, groups="2/0/1")  # whose action is whose
+    found = look.narrowing(model, latents, config)
+    np.testing.assert_array_equal(found[1], plan[[1, 2, 0]])
+    np.testing.assert_array_equal(found[0], ranges[:, [1, 2, 0]])
 
 
 @pytest.mark.parametrize("iterations", [0, 4])
-def test_shares_are_of_plans_that_start_as_the_model_s_do(iterations):
-    """Around its policy, with hardly any width or no search: what the policy's rollout is worth."""
+def test_plans_are_drawn_that_start_as_the_model_s_do(iterations):
+    """Around its policy, with hardly any width or no search: the policy's own action."""
     model, obs = random_model(1, policy=True), np.full((8, 1), 0.3, np.float32)
     config = fac.PlannerConfig(iterations=iterations, prior="own", min_std=1e-6, max_std=1e-6,
                                horizon=2)
-    plan, z = fac.policy_plan(model, obs, 3, model.config), model.encode(obs)
-    worth = fac.h_step_return(model, z, np.concatenate([plan, 0 * plan], -1), config)[0]
-    np.testing.assert_allclose(look.shares(model, model.latents(obs), config),
-                               worth[:1] - worth[1:], rtol=1e-3)
+    ranges, plan = look.narrowing(model, model.latents(obs), config)
+    expected = fac.policy_plan(model, obs, 3, model.config)[0, 0, :, 0]
+    assert ranges.shape == (iterations, 3, 2)
+    np.testing.assert_allclose(plan, expected, atol=1e-4)
+    np.testing.assert_allclose(ranges, np.broadcast_to(expected[:, None], ranges.shape), atol=1e-4)
 
 
-def test_frames_hold_pictures_and_bars():
+def test_frames_hold_pictures_and_plans():
     pytest.importorskip("PIL")
-    size, shares = look.PIXELS, np.array([1.0, -0.5])
-    frames = [(np.full((size, size, 3), 7, np.uint8), shares, 3.0)] * 4
+    size, plan = look.PIXELS, (np.array([[[-1.0, 1.0], [0.5, 1.0]]]), np.array([1.0, -0.5]))
+    frames = [(np.full((size, size, 3), 7, np.uint8), plan, 3.0)] * 4
     images = look.draw_frames([(frames, "expert, N = 2", 1.0, 3.0), (frames, "student", 2.0, 3.0)])
     width = size + look.BARS
     assert len(images) == 4 and images[0].size == (2 * width, size + look.TEXT)
     for left in (0, width):
         assert images[0].getpixel((left + 5, 5)) == (7, 7, 7)
-        middle = left + size + look.BARS // 2
-        assert images[0].getpixel((middle + 8, size // 4)) == (31, 119, 180)  # a gain, blue
-        assert images[0].getpixel((middle - 8, 3 * size // 4)) == (153, 153, 153)
-        assert images[0].getpixel((middle - 8, size // 4)) == (255, 255, 255)
+        drawn, planned = (left + size + look.BARS * x // 4 for x in (1, 3))
+
+        def color(x, joint, action, image=images[0]):
+            return image.getpixel((x, round(size / 2 * (joint + 0.5 - 0.4 * action))))
+
+        assert color(drawn, 0, -0.9) == color(drawn, 1, 0.8) == (153, 153, 153)
+        assert color(planned, 0, 1) == color(planned, 1, -0.5) == (31, 119, 180)
+        assert color(drawn, 1, 0.3) == color(planned, 0, 0.8) == (255, 255, 255)
 
 
 @pytest.mark.parametrize("name, task", [("x.gif", "pendulum-swingup"), ("x.mp4", "reacher-easy")])
