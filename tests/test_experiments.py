@@ -31,7 +31,11 @@ refused = functools.partial(toys.refused, program="experiments.py")
 
 
 def run(*arguments, cwd, env=ONE_THREAD):
+    """In a process of its own; `here` is for what isn't about processes."""
     return launch([ROOT / "data" / "experiments.py", *arguments], cwd, env)
+
+
+here = functools.partial(toys.here, experiments.main)
 
 
 @pytest.mark.parametrize("flags, parts", [
@@ -43,7 +47,7 @@ def run(*arguments, cwd, env=ONE_THREAD):
     (["figure12", "--decisions", "1000"], ["--decisions", "multiple of 2000", "not 1000"]),
     (["figure12", "--tasks", "gym:Pendulum-v1"], ["--tasks", "dm_control's"])])
 def test_bad_commands_are_refused(tmp_path, flags, parts):
-    refused(run(*flags, cwd=tmp_path), *parts)
+    refused(here(*flags, cwd=tmp_path), *parts)
 
 
 @pytest.mark.parametrize("flags", [
@@ -52,7 +56,7 @@ def test_bad_commands_are_refused(tmp_path, flags, parts):
 def test_pictures_that_cannot_be_written_are_missed_before_the_work(tmp_path, flags):
     pytest.importorskip("matplotlib")
     (tmp_path / "file").touch()  # no folder
-    refused(run(*flags, cwd=tmp_path), f"{flags[-1]}: can't be written")
+    refused(here(*flags, cwd=tmp_path), f"{flags[-1]}: can't be written")
 
 
 @pytest.mark.parametrize("command", [["table3", "--figure", "x.png"], ["figure6"]])
@@ -224,7 +228,7 @@ def test_a_run_that_does_not_fit_its_figure_is_refused_before_the_work(tmp_path)
     pytest.importorskip("joblib")
     write_rows(tmp_path / "4.csv", [("walker-run", 0, "TAP", {"steps": 3}, [{"minutes": 1.0}])])
     before = (tmp_path / "4.csv").read_bytes()
-    refused(run("figure4", "--tasks", "walker-run", "--out", "4.csv", cwd=tmp_path), "4.csv: TAP",
+    refused(here("figure4", "--tasks", "walker-run", "--out", "4.csv", cwd=tmp_path), "4.csv: TAP",
             "'steps': 3", "'steps': 5000", "--out")
     assert (tmp_path / "4.csv").read_bytes() == before
 
@@ -329,7 +333,7 @@ def test_bad_runs_are_refused(tmp_path, flags, parts):
     pytest.importorskip("matplotlib")
     pytest.importorskip("distributed" if flags[-1] in ("nowhere", "tls://host:1") else "joblib")
     before = sorted(experiments.RESULTS.iterdir())
-    refused(run(*flags, cwd=tmp_path), *parts)
+    refused(here(*flags, cwd=tmp_path), *parts)
     assert sorted(experiments.RESULTS.iterdir()) == before  # the default --out
 
 
@@ -340,16 +344,16 @@ def test_report_names_the_file_that_holds_another_figure_s_runs(tmp_path, figure
              "return_mean": 1.0, "minutes": 1.0, "versions": experiments.versions()}
             for case in ("a", "b", "c")]
     experiments.append_rows(tmp_path / f"{figure}.csv", rows)
-    refused(run("report", "--results", ".", "--figures", ".", cwd=tmp_path), f"{figure}.csv: not "
-            f"{figure}'s rows")
+    refused(here("report", "--results", ".", "--figures", ".", cwd=tmp_path),
+            f"{figure}.csv: not {figure}'s rows")
 
 
 def test_report_names_the_file_whose_rows_lack_a_return(tmp_path):
     pytest.importorskip("matplotlib")
     rows = [{**experiments.make_run("reacher-hard", 0, "expert"), "minutes": 1.0}]
     experiments.append_rows(tmp_path / "figure8.csv", rows)
-    refused(run("report", "--results", ".", "--figures", ".", cwd=tmp_path), "figure8.csv: not "
-            "figure8's rows")
+    refused(here("report", "--results", ".", "--figures", ".", cwd=tmp_path),
+            "figure8.csv: not figure8's rows")
 
 
 @pytest.mark.parametrize("found", [b"a,b\n1,2\n", b'{"not": "rows"}', b"\xff\xfe\n"])
@@ -1026,8 +1030,8 @@ def test_report_draws_what_the_csvs_hold(tmp_path):
         for case in ("expert", "student")
         for s, i, value, ms in ((512, 6, 100.0, 80.0), (64, 6, 96.0, 12.0), (64, 2, 94.0, 6.0),
                                 (16, 6, 97.0 * (case == "student"), 4.0))])
-    found = last_json(run("report", "--results", ".", "--figures", "pictures", "--json",
-                          cwd=tmp_path))
+    found = last_json(here("report", "--results", ".", "--figures", "pictures", "--json",
+                           cwd=tmp_path))
     last = {"mean": 11.0, "std": 2 ** 0.5, "seeds": 2}
     level = found["figure4"]["walker-run"].pop("expert_recorded")
     records = fac.read_records(fac.data_file("walker-run", "expert.npz"))
@@ -1337,7 +1341,7 @@ def test_watch_refuses(tmp_path, flags, parts):
     pytest.importorskip("matplotlib")
     expert, header = fac.load_model(fac.data_file("reacher-hard", "expert.npz"))
     fac.save_model(tmp_path / "slow.npz", expert, {**header, "action_repeat": 4})
-    done = run("watch", *flags, cwd=tmp_path)
+    done = here("watch", *flags, cwd=tmp_path)
     if "can't draw off-screen" in done.stderr:
         pytest.skip("neither EGL nor OSMesa here")
     refused(done, *parts)
@@ -1419,30 +1423,30 @@ def test_figure9_and_agreement_draw_a_model(tmp_path):
     for key, value in before.params.items():
         own = fresh if key.startswith("_encoder.") else student
         assert np.array_equal(value, own.params[key]), key
-    found = last_json(run("figure9", "--model", "student.npz", "--episodes", "2", "--points", "20",
-                          "--json", cwd=tmp_path))
+    found = last_json(here("figure9", "--model", "student.npz", "--episodes", "2", "--points", "20",
+                           "--json", cwd=tmp_path))
     assert found["silhouette"] is not None and set(found["moments"]) == {"best", "worst"}
     assert found["silhouette_untrained"] not in (None, found["silhouette"])
     assert (tmp_path / "figure9.png").read_bytes()[:4] == b"\x89PNG"
     sizes = fac.ModelConfig(*fac.lookup_task("finger-spin")[2:], 2, 4, 8, 8)  # none of the 11
     spin = fac.WorldModel.create(sizes, np.random.default_rng(0))
     fac.save_model(tmp_path / "spin.npz", spin, {"kind": "student", "task": "finger-spin"})
-    found = last_json(run("figure9", "--model", "spin.npz", "--episodes", "1", "--points", "20",
-                          "--json", cwd=tmp_path))
+    found = last_json(here("figure9", "--model", "spin.npz", "--episodes", "1", "--points", "20",
+                           "--json", cwd=tmp_path))
     assert found["task"] == "finger-spin"
     shutil.copy(fac.data_file("reacher-hard", "replay.npz"), tmp_path)  # beside the expert
-    found = last_json(run("agreement", "--model", "student.npz", "--expert", ".",
-                          "--episodes", "1", "--states", "8", "--json", cwd=tmp_path))
+    found = last_json(here("agreement", "--model", "student.npz", "--expert", ".",
+                           "--episodes", "1", "--states", "8", "--json", cwd=tmp_path))
     assert len(found["held_out"]) == len(found["worst_episode"]) == 3
     assert np.abs(found["when"]).max() <= 1
     assert len(found["ceiling"]) == 4 and 0.5 < found["ceiling_variance"][0] <= 1
     assert (tmp_path / "agreement.png").exists()
     for name in ("agreement", "figure9"):
-        refused(run(name, "--model", "expert.npz", cwd=tmp_path), "expert.npz", "'expert'")
+        refused(here(name, "--model", "expert.npz", cwd=tmp_path), "expert.npz", "'expert'")
     shutil.copy(fac.data_file("walker-run", "replay.npz"), tmp_path / "other.npz")
-    refused(run("agreement", "--model", "student.npz", "--expert", ".", "--replay", "other.npz",
-                cwd=tmp_path), "other.npz", "--replay")
+    refused(here("agreement", "--model", "student.npz", "--expert", ".", "--replay", "other.npz",
+                 cwd=tmp_path), "other.npz", "--replay")
     fac.save_model(tmp_path / "student.npz", student, {"kind": "student", "task": "reacher-hard",
                                                        "data": [1, 2, "reacher-hard"]})
-    refused(run("agreement", "--model", "student.npz", "--expert", "expert.npz", cwd=tmp_path),
+    refused(here("agreement", "--model", "student.npz", "--expert", "expert.npz", cwd=tmp_path),
             "another expert", "--expert")
