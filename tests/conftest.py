@@ -66,6 +66,12 @@ def no_plots(tmp_path_factory):
     return {"PYTHONPATH": str(folder), **ONE_THREAD}
 
 
+@pytest.fixture
+def short_episodes(monkeypatch):
+    """Of 50 decisions, those that this process plays."""
+    monkeypatch.setattr(fac, "CONTROL_STEPS", 100)
+
+
 @pytest.fixture(scope="session")
 def replay(tmp_path_factory):
     """24 episodes of 30 decisions."""

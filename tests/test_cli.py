@@ -3,11 +3,13 @@
 import csv
 import dataclasses
 import errno
+import functools
 import importlib.util
 import json
 import multiprocessing.resource_tracker
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -423,7 +425,7 @@ def test_evaluate_plans_a_student_as_it_was_chosen(quick, tmp_path, monkeypatch)
                     fac.PlannerConfig(horizon=1)]
 
 
-def test_part_one_alone_distils_and_goes_on_from_its_end(tmp_path, files):
+def test_part_one_alone_distils_and_goes_on_from_its_end(tmp_path, files, short_episodes):
     """--plain: the loop and the planner that Part I reads; given again it is evaluated alone."""
     arguments = distill_arguments(files, "--plain", "--workers", "0", "--json")
     first, second = (last_json(here(fac.main, *arguments, cwd=tmp_path)) for _ in range(2))
@@ -441,7 +443,8 @@ def no_more(*_, **__):
 
 @pytest.mark.parametrize("what", ["multiprocessing.util.spawnv_passfds", "os.pipe",
                                   "multiprocessing.connection.Pipe"])
-def test_where_no_process_can_be_started_none_is_needed(tmp_path, files, capsys, monkeypatch, what):
+def test_where_no_process_can_be_started_none_is_needed(tmp_path, files, capsys, monkeypatch,
+                                                        short_episodes, what):
     """At a limit of processes or of open files: --workers 0 asks for none."""
     monkeypatch.setattr(fac, "cores", lambda: 2)
     monkeypatch.setattr(multiprocessing.resource_tracker, "ensure_running", lambda: None)
@@ -507,7 +510,7 @@ def test_a_picture_costs_no_result(tmp_path, files, broken):
     assert ("curve.png: no picture: no home\n" in done.stderr) == broken
 
 
-def test_the_time_of_all_is_that_of_distilling_and_more(tmp_path, files):
+def test_the_time_of_all_is_that_of_distilling_and_more(tmp_path, files, short_episodes):
     """Of a run that is given again, or was cut off, too."""
     arguments = *distill_arguments(files, "--out", "out", "--workers", "0"), "--json"
     first = last_json(here(fac.main, *arguments, cwd=tmp_path))
@@ -703,18 +706,26 @@ def rows_without_seconds(path):
         return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
 
 
-@pytest.fixture
-def killed(tmp_path, files, no_plots):
-    """A folder whose run was killed half way, and a function that goes on there."""
-    def distill(*more, stop=-1):
-        arguments = distill_arguments(files, "--out", tmp_path / "out", *more)
-        return launch(["-c", DRIVER, stop, *arguments], tmp_path, no_plots)
+def driven(files, env, out, *more, stop=-1):
+    return launch(["-c", DRIVER, stop, *distill_arguments(files, "--out", out, *more)], out.parent,
+                  env)
 
-    assert distill(stop=3).returncode == -signal.SIGKILL
-    assert sorted(os.listdir(tmp_path / "out")) == ["checkpoint.npz", "curve.csv"]
-    with np.load(tmp_path / "out" / "checkpoint.npz") as file:
+
+@pytest.fixture(scope="module")
+def killed_once(tmp_path_factory, files, no_plots):
+    out = tmp_path_factory.mktemp("killed") / "out"
+    assert driven(files, no_plots, out, stop=3).returncode == -signal.SIGKILL
+    assert sorted(os.listdir(out)) == ["checkpoint.npz", "curve.csv"]
+    with np.load(out / "checkpoint.npz") as file:
         assert file["step"] == 1  # so that two steps are taken twice
-    return tmp_path / "out", distill
+    return out
+
+
+@pytest.fixture
+def killed(tmp_path, files, no_plots, killed_once):
+    """A folder whose run was killed half way, and a function that goes on there."""
+    out = shutil.copytree(killed_once, tmp_path / "out")
+    return out, functools.partial(driven, files, no_plots, out)
 
 
 def test_a_killed_run_goes_on_as_if_nothing_had_been(killed, distilled):
@@ -732,14 +743,12 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(killed, distilled):
     assert (student_in(out), (out / "curve.csv").read_bytes()) == before
 
 
-def test_a_killed_run_whose_expert_plays_goes_on(tmp_path, files, no_plots):
+def test_a_killed_run_whose_expert_plays_goes_on(tmp_path, files, no_plots, distilled):
     """The expert's episodes depend on the seed alone, whoever plays them [D8]."""
     def distill(out, *more, stop=-1):
-        arguments = distill_arguments(files, "--expert-episodes", "2", "--out", tmp_path / out,
-                                      *more)
-        return launch(["-c", DRIVER, stop, *arguments], tmp_path, no_plots)
+        return driven(files, no_plots, tmp_path / out, "--expert-episodes", "2", *more, stop=stop)
 
-    told = succeeded(distill("whole", "--workers", "1")).stdout
+    told = succeeded(distill("whole", "--workers", "0")).stdout
     assert "chosen by playing 1 episodes of the run's own seeds" in told
     assert "\npolicy " in told and "\nplans " in told
     for stop in (3, 5):
@@ -747,11 +756,9 @@ def test_a_killed_run_whose_expert_plays_goes_on(tmp_path, files, no_plots):
     with np.load(tmp_path / "parts" / "checkpoint.npz") as file:
         assert file["played"].shape == (2 * fac.EPISODE_STEPS, 8 + 3)  # states and actions
         assert file["lengths"].tolist() == [fac.EPISODE_STEPS] * 2
-    succeeded(distill("parts"))
+    succeeded(distill("parts", "--workers", "1"))
     assert student_in(tmp_path / "parts") == student_in(tmp_path / "whole")
-    without = distill_arguments(files, "--out", tmp_path / "without")
-    succeeded(launch(["-c", DRIVER, -1, *without], tmp_path, no_plots))
-    assert student_in(tmp_path / "without")[0] != student_in(tmp_path / "whole")[0]
+    assert student_in(distilled[1])[0] != student_in(tmp_path / "whole")[0]  # without its episodes
 
 
 @pytest.mark.parametrize("flags, parts", [
@@ -774,7 +781,7 @@ def test_a_checkpoint_with_other_settings_is_refused(killed, files, capsys, flag
     assert (out / "checkpoint.npz").read_bytes() == before
 
 
-def test_an_expert_s_own_elites_are_not_its_student_s(files, tmp_path, capsys):
+def test_an_expert_s_own_elites_are_not_its_student_s(files, tmp_path, capsys, short_episodes):
     """Table 2's 64 of 512 are more than a student's 32 samples."""
     model, header = fac.load_model(files / "expert.npz")
     fac.save_model(path := tmp_path / "expert.npz", model, {

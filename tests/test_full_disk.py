@@ -69,7 +69,8 @@ def test_stderr(out):
 
 def test_distill(tmp_path, files, monkeypatch):
     command = distill_arguments(files)
-    monkeypatch.setattr(fac, "evaluate", lambda *_: {"returns": [1.0]})
+    monkeypatch.setattr(fac, "compare", lambda *_: {})
+    monkeypatch.setattr(fac, "report", lambda *_: None)
     for size in (50, 1000):
         full_disk("checkpoint.npz", size, "fac_tdmpc_ref.py", *command, "--out", "a", cwd=tmp_path)
     for out in ("a", "b"):
@@ -86,7 +87,7 @@ def test_experiments(tmp_path):
     command = [*SWEEP, *SET]
     full_disk("sweep.csv", 20, "data/experiments.py", *command, cwd=tmp_path)
     assert experiments.read_rows(tmp_path / "sweep.csv") == []
-    succeeded(launch([ROOT / "data" / "experiments.py", *command], tmp_path))
+    succeeded(here(experiments.main, *command, cwd=tmp_path))
     assert len(experiments.finished(experiments.read_rows(tmp_path / "sweep.csv"))) == 1
 
 
@@ -99,6 +100,6 @@ def test_import_expert(tmp_path, files):
 def test_manipulator_demo(tmp_path):
     pytest.importorskip("matplotlib")
     (tmp_path / "m.png").write_bytes(b"old")
-    full_disk("m.png", 1000, "manipulator_demo.py", "--figure", "m.png", cwd=tmp_path,
-              picture=True)
+    full_disk("m.png", 1000, "manipulator_demo.py", "--figure", "m.png", "--steps", "2",
+              "--ik", "closed-form", cwd=tmp_path, picture=True)
     assert (tmp_path / "m.png").read_bytes() == b"old"
