@@ -7,6 +7,10 @@ import pytest  # noqa: E402
 from toys import BLOCKED, ONE_THREAD, fac, write_expert, write_replay  # noqa: E402
 
 SKIPPED = []  # tests, and files of them, of this run
+QUICK = {f"test_{name}" for name in (
+    "layers", "planning", "priors", "distill", "equation1", "data", "students", "project")}
+SLOW = ("worker", "process", "hang", "parent", "learns_the_experts_order", "keeps_its_memory",
+        "taught_priors", "damage_anywhere", "plain_step")  # of these, in their names
 
 
 def pytest_addoption(parser):
@@ -22,14 +26,19 @@ def pytest_collectreport(report):
 pytest_runtest_logreport = pytest_collectreport
 
 
+@pytest.hookimpl(tryfirst=True)  # before -m chooses
 def pytest_collection_modifyitems(config, items):
+    for item in items:
+        if item.path.stem in QUICK and not any(word in item.name for word in SLOW):
+            item.add_marker("quick")
     if config.getoption("skipped"):
         before = tuple(config.cache.get("skipped", []))
         items[:] = [item for item in items if item.nodeid.startswith(before)]
 
 
 def pytest_sessionfinish(session):
-    session.config.cache.set("skipped", SKIPPED)
+    if not hasattr(session.config, "workerinput"):  # pytest-xdist's processes tell the first
+        session.config.cache.set("skipped", SKIPPED)
 
 
 @pytest.fixture(scope="session")
@@ -55,6 +64,12 @@ def no_plots(tmp_path_factory):
     folder = tmp_path_factory.mktemp("blocked")
     (folder / "matplotlib.py").write_text(BLOCKED)
     return {"PYTHONPATH": str(folder), **ONE_THREAD}
+
+
+@pytest.fixture
+def short_episodes(monkeypatch):
+    """Of 50 decisions, those that this process plays."""
+    monkeypatch.setattr(fac, "CONTROL_STEPS", 100)
 
 
 @pytest.fixture(scope="session")

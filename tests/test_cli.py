@@ -3,11 +3,13 @@
 import csv
 import dataclasses
 import errno
+import functools
 import importlib.util
 import json
 import multiprocessing.resource_tracker
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -22,8 +24,8 @@ import pytest
 
 import fac_tdmpc_ref as fac
 from toys import (BUDGET, ONE_THREAD, ROOT, SCRIPT, STEPS, TINY, TRAINING, WATCHED,
-                  distill_arguments, last_json, launch, random_model, refused, run, student_in,
-                  succeeded, write_expert)
+                  distill_arguments, here, last_json, launch, random_model, refused, run,
+                  student_in, succeeded, write_expert)
 
 KEYS = {"task", "seed", "steps", "seconds", "expert_return_mean", "expert_return_std",
         "student_return_mean", "student_return_std", "episodes", "kl_reward", "kl_value",
@@ -199,7 +201,13 @@ def test_interrupt_is_one_line_and_status_130(monkeypatch, capsys):
 ])
 def test_distill_refuses(tmp_path, files, flags, parts):
     flags = [flag.format(files=files) for flag in flags]
-    refused(run(*distill_arguments(files, *flags), cwd=tmp_path), *parts)
+    refused(here(fac.main, *distill_arguments(files, *flags), cwd=tmp_path), *parts)
+
+
+@pytest.mark.parametrize("flags", [["--steps", "x"], ["--steps", "0"]])
+def test_a_refusal_is_the_process_s_status_and_its_one_line(tmp_path, files, flags):
+    """Of argparse, and of what is found later."""
+    refused(run(*distill_arguments(files, *flags), cwd=tmp_path), "steps")
 
 
 def test_too_little_memory_is_one_line(monkeypatch, capsys):
@@ -237,25 +245,26 @@ def test_what_diverges_is_refused_and_leaves_no_weights(tmp_path, files, steps):
     (["evaluate", "--model", "{files}/expert.npz", "--seed", "-1"], ["--seed", "-1"]),
 ])
 def test_other_bad_commands_are_refused(tmp_path, files, arguments, parts):
-    refused(run(*(a.format(files=files) for a in arguments), cwd=tmp_path), *parts)
+    refused(here(fac.main, *(a.format(files=files) for a in arguments), cwd=tmp_path), *parts)
 
 
 def test_a_task_without_data_says_what_to_do(tmp_path):
     task = "acrobot-swingup"
-    refused(run("distill", "--task", task, cwd=tmp_path), f"train_expert.py --task {task}",
-            "--expert", "holds")
+    refused(here(fac.main, "distill", "--task", task, cwd=tmp_path),
+            f"train_expert.py --task {task}", "--expert", "holds")
     assert os.listdir(tmp_path) == []
 
 
 def test_a_student_is_no_expert(tmp_path, files, distilled):
     _, folder = distilled
-    done = run(*distill_arguments(files, "--expert", folder / "student.npz"), cwd=tmp_path)
-    refused(done, "student.npz", "kind", "'expert'", "'student'")
+    arguments = distill_arguments(files, "--expert", folder / "student.npz")
+    refused(here(fac.main, *arguments, cwd=tmp_path), "student.npz", "kind", "'expert'",
+            "'student'")
 
 
 def test_the_replay_is_the_one_beside_the_expert(tmp_path, files):
     (tmp_path / "expert.npz").write_bytes((files / "expert.npz").read_bytes())
-    refused(run("distill", "--expert", tmp_path / "expert.npz", *TINY, cwd=tmp_path),
+    refused(here(fac.main, "distill", "--expert", tmp_path / "expert.npz", *TINY),
             str(tmp_path / "replay.npz"), "no such file")
 
 
@@ -416,15 +425,16 @@ def test_evaluate_plans_a_student_as_it_was_chosen(quick, tmp_path, monkeypatch)
                     fac.PlannerConfig(horizon=1)]
 
 
-def test_part_one_alone_distils_and_goes_on_from_its_end(tmp_path, files):
+def test_part_one_alone_distils_and_goes_on_from_its_end(tmp_path, files, short_episodes):
     """--plain: the loop and the planner that Part I reads; given again it is evaluated alone."""
     arguments = distill_arguments(files, "--plain", "--workers", "0", "--json")
-    first, second = (last_json(succeeded(run(*arguments, cwd=tmp_path, env={}))) for _ in range(2))
+    first, second = (last_json(here(fac.main, *arguments, cwd=tmp_path)) for _ in range(2))
     assert first["student_returns"] == second["student_returns"] and first["kl_value"] > 0
     header, _ = fac.read_npz(tmp_path / "runs/reacher-hard-0/student.npz", ("student",))
     assert header["distill"]["targets"] == "joint" and header["distill"]["reuse"] == 1
     assert header["planner"]["prior"] == "last"
-    refused(run(*arguments, "--targets", "credit", cwd=tmp_path), "--plain", "without --targets")
+    refused(here(fac.main, *arguments, "--targets", "credit", cwd=tmp_path), "--plain",
+            "without --targets")
 
 
 def no_more(*_, **__):
@@ -433,7 +443,8 @@ def no_more(*_, **__):
 
 @pytest.mark.parametrize("what", ["multiprocessing.util.spawnv_passfds", "os.pipe",
                                   "multiprocessing.connection.Pipe"])
-def test_where_no_process_can_be_started_none_is_needed(tmp_path, files, capsys, monkeypatch, what):
+def test_where_no_process_can_be_started_none_is_needed(tmp_path, files, capsys, monkeypatch,
+                                                        short_episodes, what):
     """At a limit of processes or of open files: --workers 0 asks for none."""
     monkeypatch.setattr(fac, "cores", lambda: 2)
     monkeypatch.setattr(multiprocessing.resource_tracker, "ensure_running", lambda: None)
@@ -499,14 +510,14 @@ def test_a_picture_costs_no_result(tmp_path, files, broken):
     assert ("curve.png: no picture: no home\n" in done.stderr) == broken
 
 
-def test_the_time_of_all_is_that_of_distilling_and_more(tmp_path, files, no_plots):
+def test_the_time_of_all_is_that_of_distilling_and_more(tmp_path, files, short_episodes):
     """Of a run that is given again, or was cut off, too."""
     arguments = *distill_arguments(files, "--out", "out", "--workers", "0"), "--json"
-    first = last_json(run(*arguments, cwd=tmp_path, env=no_plots))
+    first = last_json(here(fac.main, *arguments, cwd=tmp_path))
     assert first["seconds_total"] >= first["seconds"]
     header, arrays = fac.read_npz(path := tmp_path / "out" / "checkpoint.npz", ("checkpoint",))
     fac.write_npz(path, {**header, "seconds": 5000.0}, arrays)
-    again = last_json(run(*arguments, cwd=tmp_path, env=no_plots))
+    again = last_json(here(fac.main, *arguments, cwd=tmp_path))
     assert 5000 <= again["seconds"] < again["seconds_total"] < 5000 + 120
 
 
@@ -695,18 +706,26 @@ def rows_without_seconds(path):
         return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
 
 
-@pytest.fixture
-def killed(tmp_path, files, no_plots):
-    """A folder whose run was killed half way, and a function that goes on there."""
-    def distill(*more, stop=-1):
-        arguments = distill_arguments(files, "--out", tmp_path / "out", *more)
-        return launch(["-c", DRIVER, stop, *arguments], tmp_path, no_plots)
+def driven(files, env, out, *more, stop=-1):
+    return launch(["-c", DRIVER, stop, *distill_arguments(files, "--out", out, *more)], out.parent,
+                  env)
 
-    assert distill(stop=3).returncode == -signal.SIGKILL
-    assert sorted(os.listdir(tmp_path / "out")) == ["checkpoint.npz", "curve.csv"]
-    with np.load(tmp_path / "out" / "checkpoint.npz") as file:
+
+@pytest.fixture(scope="module")
+def killed_once(tmp_path_factory, files, no_plots):
+    out = tmp_path_factory.mktemp("killed") / "out"
+    assert driven(files, no_plots, out, stop=3).returncode == -signal.SIGKILL
+    assert sorted(os.listdir(out)) == ["checkpoint.npz", "curve.csv"]
+    with np.load(out / "checkpoint.npz") as file:
         assert file["step"] == 1  # so that two steps are taken twice
-    return tmp_path / "out", distill
+    return out
+
+
+@pytest.fixture
+def killed(tmp_path, files, no_plots, killed_once):
+    """A folder whose run was killed half way, and a function that goes on there."""
+    out = shutil.copytree(killed_once, tmp_path / "out")
+    return out, functools.partial(driven, files, no_plots, out)
 
 
 def test_a_killed_run_goes_on_as_if_nothing_had_been(killed, distilled):
@@ -724,14 +743,12 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(killed, distilled):
     assert (student_in(out), (out / "curve.csv").read_bytes()) == before
 
 
-def test_a_killed_run_whose_expert_plays_goes_on(tmp_path, files, no_plots):
+def test_a_killed_run_whose_expert_plays_goes_on(tmp_path, files, no_plots, distilled):
     """The expert's episodes depend on the seed alone, whoever plays them [D8]."""
     def distill(out, *more, stop=-1):
-        arguments = distill_arguments(files, "--expert-episodes", "2", "--out", tmp_path / out,
-                                      *more)
-        return launch(["-c", DRIVER, stop, *arguments], tmp_path, no_plots)
+        return driven(files, no_plots, tmp_path / out, "--expert-episodes", "2", *more, stop=stop)
 
-    told = succeeded(distill("whole", "--workers", "1")).stdout
+    told = succeeded(distill("whole", "--workers", "0")).stdout
     assert "chosen by playing 1 episodes of the run's own seeds" in told
     assert "\npolicy " in told and "\nplans " in told
     for stop in (3, 5):
@@ -739,11 +756,9 @@ def test_a_killed_run_whose_expert_plays_goes_on(tmp_path, files, no_plots):
     with np.load(tmp_path / "parts" / "checkpoint.npz") as file:
         assert file["played"].shape == (2 * fac.EPISODE_STEPS, 8 + 3)  # states and actions
         assert file["lengths"].tolist() == [fac.EPISODE_STEPS] * 2
-    succeeded(distill("parts"))
+    succeeded(distill("parts", "--workers", "1"))
     assert student_in(tmp_path / "parts") == student_in(tmp_path / "whole")
-    without = distill_arguments(files, "--out", tmp_path / "without")
-    succeeded(launch(["-c", DRIVER, -1, *without], tmp_path, no_plots))
-    assert student_in(tmp_path / "without")[0] != student_in(tmp_path / "whole")[0]
+    assert student_in(distilled[1])[0] != student_in(tmp_path / "whole")[0]  # without its episodes
 
 
 @pytest.mark.parametrize("flags, parts", [
@@ -766,7 +781,7 @@ def test_a_checkpoint_with_other_settings_is_refused(killed, files, capsys, flag
     assert (out / "checkpoint.npz").read_bytes() == before
 
 
-def test_an_expert_s_own_elites_are_not_its_student_s(files, tmp_path, capsys):
+def test_an_expert_s_own_elites_are_not_its_student_s(files, tmp_path, capsys, short_episodes):
     """Table 2's 64 of 512 are more than a student's 32 samples."""
     model, header = fac.load_model(files / "expert.npz")
     fac.save_model(path := tmp_path / "expert.npz", model, {
@@ -912,11 +927,10 @@ def test_a_model_that_names_no_task_needs_one(tmp_path, distilled, capsys):
 
 def test_evaluation_does_not_depend_on_the_number_of_workers(tmp_path, distilled):
     student = distilled[1] / "student.npz"
-    found = [last_json(run("evaluate", "--model", student, "--episodes", "2", "--seed", "3",
-                           "--workers", workers, "--json", *BUDGET, cwd=tmp_path))
+    command = ["evaluate", "--model", student, "--episodes", "2", "--seed", "3", "--json", *BUDGET]
+    found = [last_json(here(fac.main, *command, "--workers", workers, cwd=tmp_path))
              for workers in (0, 1, 2)]
-    assert last_json(run("evaluate", "--model", student, "--episodes", "2", "--seed", "3",
-                         "--json", *BUDGET, cwd=tmp_path, env={**ONE_THREAD, "TQDM_DISABLE": "1"})
+    assert last_json(run(*command, cwd=tmp_path, env={**ONE_THREAD, "TQDM_DISABLE": "1"})
                      )["returns"] == found[0]["returns"]
     for result in found:
         assert {"return_mean", "return_std", "returns", "plan_ms_median", "episodes"} <= set(result)
@@ -930,8 +944,8 @@ def test_evaluation_does_not_depend_on_the_number_of_workers(tmp_path, distilled
 
 def test_returns_that_are_no_whole_numbers_add_up_alike(tmp_path):
     write_expert(tmp_path / "walker.npz", "walker-walk", (24, 6))
-    found = [last_json(run("evaluate", "--model", "walker.npz", "--episodes", "1", "--workers",
-                           workers, "--json", *BUDGET, cwd=tmp_path))["returns"]
+    command = ["evaluate", "--model", "walker.npz", "--episodes", "1", "--json", *BUDGET]
+    found = [last_json(here(fac.main, *command, "--workers", workers, cwd=tmp_path))["returns"]
              for workers in (0, 1)]
     assert found[0] == found[1] and found[0][0] % 1
 
@@ -1099,40 +1113,7 @@ def test_a_spoilt_record_is_named(tmp_path, text):
         fac.read_records(tmp_path / "expert.npz")
 
 
-# the project --------------------------------------------------------------------------
-
-
-def test_continuous_integration_runs_the_readme_s_test_command():
-    """In an environment that holds nothing else: what it installs for more comes later."""
-    lines = (ROOT / ".ci" / "run").read_text().splitlines()
-    (at,) = [i for i, line in enumerate(lines) if line.endswith("pytest tests")]
-    assert lines[at] in (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
-    assert not [line for line in lines[:at] if re.search(r"\.venv/bin/pip", line)]
-
-
-def test_the_readme_s_tests_skip_what_needs_pytorch_or_dask_alone():
-    """Of what libraries lack: its extra brings all others."""
-    project = (ROOT / "pyproject.toml").read_text()
-    brought = set(re.findall(r"[\w-]+", " ".join(re.findall(
-        r"^(?:test|experiments) = \[(.*)\]$", project, re.M))))
-    by = {"PIL": "matplotlib", "sklearn": "scikit-learn", "imageio_ffmpeg": "ffmpeg"}
-    for path in (ROOT / "tests").glob("test_*.py"):
-        for name in re.findall(r'importorskip\(\s*"(\w+)', path.read_text("utf-8")):
-            assert by.get(name, name) in brought | {"torch", "distributed"}, (path, name)
-
-
-def test_durations_are_of_a_clock_that_nobody_sets():
-    """A checkpoint of one that was set back would count as damaged."""
-    for path in (*ROOT.glob("*.py"), *(ROOT / "data").glob("*.py")):
-        assert not re.search(r"\btime\.time\(|\bdatetime\b", path.read_text("utf-8")), path
-
-
-def test_mujoco_and_dm_control_are_pinned_as_a_pair():
-    dependencies = re.search(r"^dependencies = \[(.*?)\]$", (ROOT / "pyproject.toml").read_text(),
-                             re.M | re.S).group(1)
-    names = re.findall(r'"([^"]+)"', dependencies)
-    assert "mujoco==3.17.0" in names and "dm-control==1.0.50" in names
-    assert not [name for name in names if "torch" in name or "matplotlib" in name]
+# the README -------------------------------------------------------------------------
 
 
 def test_the_readme_distils_an_expert_of_one_s_own(tmp_path, monkeypatch):

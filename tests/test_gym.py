@@ -459,7 +459,7 @@ def test_pendulum_is_learned_in_a_minute_and_distilled(tmp_path, capsys):
         "2400", "--updates-per-step", "0.6", "--lr", "2e-3", "--latent-dim", "8", "--enc-dim", "32",
         "--mlp-dim", "64", "--batch-size", "64", "--plan-samples", "32", "--plan-iterations", "2",
         "--plan-pi-trajs", "8", "--evaluate-every", "99999", "--evaluate-episodes", "1",
-        "--episodes", "20", "--workers", "1", "--out", str(out), "--json"]) == 0
+        "--episodes", "8", "--workers", "1", "--out", str(out), "--json"]) == 0
     found = last(capsys)
     assert found["return_mean"] > -300 and found["updates"] == 2880
     expert, header = fac.load_model(out / "expert.npz")
@@ -468,5 +468,5 @@ def test_pendulum_is_learned_in_a_minute_and_distilled(tmp_path, capsys):
                                           latent_dim=16, enc_dim=32, mlp_dim=64)) as distiller:
         list(distiller.run())
     planning = fac.PlannerConfig(**{**fac.made_for(header, out), "samples": 64, "iterations": 3})
-    returns = fac.evaluate(distiller.student, "gym:Pendulum-v1", planning, 20, 0, 0)["returns"]
+    returns = fac.evaluate(distiller.student, "gym:Pendulum-v1", planning, 8, 0, 0)["returns"]
     assert distiller.student.config.num_agents == 1 and -300 < np.mean(returns) < 0

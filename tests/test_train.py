@@ -15,14 +15,14 @@ import pytest
 import fac_tdmpc_ref as fac
 import own_robot
 import train_expert
-from toys import (ONE_THREAD, ROOT, TRAINING, WATCHED, last_json, launch, ramp, refused, run,
+from toys import (ONE_THREAD, ROOT, TRAINING, WATCHED, here, last_json, launch, ramp, refused,
                   succeeded)
 
 SCRIPT = ROOT / "data" / "train_expert.py"
 
 
 def train(*arguments, cwd):
-    return launch([SCRIPT, *TRAINING, *arguments], cwd)
+    return here(train_expert.main, *TRAINING, *arguments, cwd=cwd)
 
 
 def episode(rng, value):
@@ -180,7 +180,7 @@ def test_an_episode_may_get_new_weights_on_its_way():
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A finished run: (its process, its folder)."""
+    """A finished run: (what it printed, its folder)."""
     folder = tmp_path_factory.mktemp("train")
     return train("--episodes", "1", "--out", "whole", "--json", cwd=folder), folder / "whole"
 
@@ -208,9 +208,10 @@ def test_train_prints_json_and_writes_what_distill_takes(trained, tmp_path):
     # every 2000 decisions, and what came out; in the row whose weights were tested
     assert [bool(r["eval_expert"] and r["eval_student"]) for r in rows] == [False, True, True]
     assert fac.Replay(folder / "replay.npz").transitions == 3000
-    distilled = run("distill", "--task", "reacher-easy", "--expert", folder, "--steps", "3",
-                    "--expert-episodes", "0", "--episodes", "1", "--plan-samples", "8",
-                    "--plan-iterations", "1", "--held-out", "0.5", "--json", cwd=tmp_path)
+    distilled = here(fac.main, "distill", "--task", "reacher-easy", "--expert", folder, "--steps",
+                     "3", "--expert-episodes", "0", "--episodes", "1", "--plan-samples", "8",
+                     "--plan-iterations", "1", "--held-out", "0.5", "--json", "--workers", "0",
+                     cwd=tmp_path)
     assert last_json(distilled)["steps"] == 3
 
 

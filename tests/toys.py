@@ -44,7 +44,7 @@ CONFIG = fac.DistillConfig(steps=300, batch_size=16, warmup=20, lr=3e-3, horizon
 ROBOTS = {"reacher-hard": (8, 3), "hopper-hop": (15, 4), "walker-walk": (24, 6)}
 SWEEP = ["sweep", "--tasks", "cheetah-run", "--seeds", "0", "--steps", "4", "--episodes", "1",
          "--samples", "8", "--iterations", "1", "--out", "sweep.csv"]
-SET = ["--set", "expert-episodes=0", "batch-size=2"]
+SET = ["--set", "expert-episodes=0", "batch-size=2", "priors=false"]
 
 
 def numeric_gradient(function, x, step=1e-6):
