@@ -426,7 +426,7 @@ def draw_credit(figure, found):
               "credited": "student of credit"}
     for ax, (key, title) in zip(axes, titles.items()):
         draw_bars(ax, {f"joint {i}": part for i, part in enumerate(found[key])}, JOINTS)
-        draw_sums(ax, {"their sum": found[key].sum(0), "expert's $Q_k - Q_0$": found["Q"]})
+        draw_sums(ax, {"their sum": found[key].sum(0), "expert's $Q_H^k - Q_H^0$": found["Q"]})
         ax.set(title=title, xlabel="copy k")
         ax.sharey(axes[0])
     draw_bars(right, {"of Eq. 4": found["student r"], "of credit": found["credited r"]},
@@ -490,99 +490,103 @@ def draw(path, name, found):
 TEXT = """\
 # The method in pictures
 
-`python data/tour.py` made this page: it distils two small students of the 3-link arm
-(reacher-hard), {steps} steps each, and shows how learning begins; the [README](../README.md) says
-how it ends. Read it beside Part I of `fac_tdmpc_ref.py`. Joints count from 0, as in the paper's
-Figure 9.
+`python data/tour.py` made this page: it distils two small students of a 3-link arm (reacher-hard),
+{steps} steps each, and shows how learning begins; the [README](../README.md) says how it ends. Read
+it beside Part I of `fac_tdmpc_ref.py`. H = {H}, gamma = 0.99, lambda = 0.5, T = 0.5; joints and
+copies count from 0; ± and error bars are standard errors.
 
 ## 1. Layers and the agent axis
 
-![The first layer of f_T: the expert's is a full matrix, the student's three blocks. Bars: numbers
-of weights.](figures/tour-1-layers.png)
+![f_T's first layer: a full matrix, three blocks. Bars: numbers of
+weights.](figures/tour-1-layers.png)
 
 A layer's weights are one array (N, out, in); `linear` multiplies each agent's matrix with that
 agent's input. The expert, N = 1, reads the whole latent s and all actions for every output. The
-student, N = 3, has three blocks; white means no weights. So the next s^i depends on s^i and a^i
-alone; f_R^i and f_Q^i are built alike. Only the encoder f_E (`WorldModel.encode`) is shared; its
-output is cut into s^0, s^1, s^2.
+student, N = 3, has three blocks and nothing between them: the next s^i depends on s^i and a^i
+alone. f_R^i and both f_Q^i are built alike, all narrower than the expert's. Only the encoder f_E
+(`WorldModel.encode`) is shared, the expert's included; its output is cut into s^0, s^1, s^2.
 
 ## 2. One trajectory and its copies
 
-![Actions of three joints, as done and in noisy copies; the expert's Q of each and its
-softmax.](figures/tour-2-copies.png)
+![Three joints' actions in noisy copies; the expert's Q and its softmax.](figures/tour-2-copies.png)
 
-Take a recorded observation g and the {L} actions that followed. `perturbed_actions` makes {K}
-copies with noise; here copy 0 stays as it was. `unroll` rolls the expert's latent out under each
-copy; `predict` gives reward and Q at every step h. A planner needs the copies' order. The
-softmax, p_k = exp(Q_k / T) divided by its sum over k, keeps it: all Q_{H} are near {level}, which
-it forgets; copy {k_best}, the best, gets {p_best}, copy {k_worst}, the worst, {p_worst}. This is
-the expert's half of Equation 4. (Drawn: the most typical of {states} held-out trajectories.)
+Take a recorded observation and the {L} actions that followed. `perturbed_actions` makes {K} copies
+with noise; here copy 0 stays as it was. `unroll` rolls the expert's latent out; `predict` gives
+reward R_h^k and value Q_h^k of copy k at step h. A softmax makes them a distribution:
+
+    p_h^k = exp(Q_h^k / T) / sum_j exp(Q_h^j / T)
+
+It ignores what copies have in common (all Q_{H} are near {level}) and keeps order and gaps, all a
+planner needs: copy {k_best}, the best, gets {p_best}, copy {k_worst}, the worst, {p_worst}. (Of
+{states} held-out trajectories, the one nearest to the mean divergences is drawn.)
 
 ## 3. The student learns
 
-![Softmax of Q, flat before learning, nearer to the expert's after. Below: the
-divergence.](figures/tour-3-softmax.png)
+![Softmax of Q, before and after learning. Below: the divergence.](figures/tour-3-softmax.png)
 
-The student predicts the same copies. `soft_kl` says how far its softmax p^s is from the expert's
-p^e: D is the sum over k of p^e_k log(p^e_k / p^s_k), 0 only where both agree. A fresh student's
-last layers are zero: all copies seem alike. `distill_loss` adds up D of R_h and Q_h, with weights
-lambda^h; `distill`, Algorithm 1, follows its gradient. On held-out trajectories D of Q_0 falls
-from {D0_before} to {D0_after}, of Q_{H} from {DH_before} to {DH_after}. The rewards' D is small
-already: this arm is rewarded at its target only.
+The student predicts the same copies; `soft_kl` compares its softmax p with the expert's p*. This is
+Equation 4:
+
+    D_h = sum_k p*_h^k log(p*_h^k / p_h^k)
+
+D is 0 only where both agree. A fresh student's last layers are zero: all copies seem alike.
+`distill_loss` adds up D of R_h and Q_h, weighted by lambda^h; `distill` follows its gradient. On
+held-out trajectories D of Q_0 falls from {D0_before} to {D0_after}, of Q_{H} from {DH_before} to
+{DH_after}. Rewards are hardly learned yet: the arm earns at its target only, so most copies earn
+alike.
 
 ## 4. Sums of shares
 
-![Bars: shares of a reward and a Q, for each copy. Dots: their sum. Diamonds: the
-expert's.](figures/tour-4-shares.png)
+![Bars: shares of a reward and a Q. Dots: sums. Diamonds: the expert's.](figures/tour-4-shares.png)
 
-`run_heads` returns each joint's share; `predict` adds them up. Equation 4 sees only the sum's
-differences between copies, so the picture leaves the mean out. The sums are too small yet; over
-all trajectories they correlate with the expert's by {r_Q} for Q_{H}, {r_R} for R_{h_R}.
+`run_heads` returns each joint's share; `predict` adds them up. Equation 4 sees differences between
+copies alone, so the picture leaves the mean out. The sums are too small yet, some of the wrong
+sign; over all trajectories they correlate with the expert's by {r_Q} for Q_{H}, {r_R} for R_{h_R}.
 
 ## 5. Each joint searches alone
 
-![Samples of joint 0's first action, elites and mean, for one agent and three. Right: G
+![Samples, elites and mean of joint 0's first action, N = 1 and 3. Right: G
 gained.](figures/tour-5-mppi.png)
 
-`h_step_return` is Equation 2: H rewards, then Q. `mppi` looks for actions that make it large. An
-iteration draws {samples} sequences around a mean, keeps the best {elites} (elites), and moves
-mean and width to these. Both use the same student. With N = 1 one agent ranks sequences of all
-joints by G: a poor action of joint 0 survives where its neighbours were lucky. With N = 3 each
-joint ranks its own by G_i, and narrows faster. Over 32 states its plans gain {gain_all} above
-doing nothing; N = 1 gains {gap} less.
+`h_step_return` is Equation 2: G = R_0 + gamma R_1 + gamma^2 R_2 + gamma^3 Q_3. `mppi` makes it
+large: an iteration draws {samples} sequences around a mean, keeps the best {elites} (elites), and
+moves mean and width to theirs. Here N says who ranks, in the same student. One agent ranks
+sequences of all joints by G: a poor action of joint 0 survives where its neighbours were lucky.
+Three rank their own by G_i, and narrow faster. Over 32 states their plans gain {gain_all} of the
+student's G above zero actions, one agent's {gap} less.
 
 ## 6. Proposition 1
 
-![Maps of G over sequences of joints 0 and 1, with each row's best column. Right: each
+![Maps of G over sequences of joints 0 and 1, each row's best marked. Right: each
 G_i.](figures/tour-6-grid.png)
 
-Let each joint choose among {P} sequences of -1 and +1 (0: always -1, {P_last}: always +1; in the
-maps joint 2 has its best); try all {combinations} combinations. The student's best is ({best}):
-the best of each joint's own G_i, found in {each} evaluations. For G is the sum of the G_i, and
-G_0 depends on joint 0's actions alone. Whatever the others do, its best stays its best: the dots
-form a line. This is Equation 3: argmax G is (argmax G_0, argmax G_1, argmax G_2). The expert's
-dots visit {columns} columns: joint 0's best depends on joint 1. By the expert's G the student's
-best is number {rank}: Proposition 1 speaks of the student's own.
+Let each joint choose among {P} sequences of -1 and +1 (binary numbers); try all {combinations}
+combinations. (Light: large G; joint 2 at its best.) The student's best is ({best}): the best of
+each joint's own G_i, found in {each} evaluations. For G is the sum of the G_i, and G_0 depends on
+joint 0's actions alone; the others add a constant. So the dots form a line. That is Equation 3:
+argmax G is (argmax G_0, argmax G_1, argmax G_2). The expert's dots visit {columns} columns: joint
+0's best depends on joint 1. By the expert's G the student's best is number {rank}: Proposition 1
+speaks of the student's own.
 
 ## 7. Credit: what each joint did
 
-![Bars: each joint's part of a change in Q, by the expert and both students. Right:
-correlations.](figures/tour-7-credit.png)
+![Bars: each joint's part of a change in Q. Right: correlations.](figures/tour-7-credit.png)
 
 Equation 4 says what shares add up to, not whose they are. `credit`, which this project adds, asks
-the expert's gradients. On the way from copy 0 to copy k, Q changes by gradient times change of
-action: a sum over joints, whose terms are their parts. `credit` takes the gradients at both ends
-and shares evenly what these miss, so the parts add up to Q_k - Q_0. A second student learned
-them, with an Equation 4 for each joint. Its shares correlate with them by {r_credit}, the first
-student's by {r_joint}.
+the expert's gradients. From copy 0 to copy k, Q_{H} (here the mean of both Q networks) changes by
+about gradient times change of action: a sum over joints, whose terms are their parts. `credit`
+averages the gradients at both ends and gives each joint an equal part of the remainder. A second
+student learned these: a softmax over copies for each joint's own part. Its shares correlate with
+them by {r_credit}, the first student's by {r_joint}.
 
 ## 8. What a decision costs
 
 ![Bars: time of a decision, by network.](figures/tour-8-cost.png)
 
-`AgentPlanner.plan` runs f_T, f_R and f_Q for every sample. In the same search the student's take
-{part_student}% of the expert's multiply-adds, one joint's {part_joint}%: with a processor for
-each joint, a decision waits for no more. Most default students act without a search, by priors.
+`AgentPlanner.plan` runs f_T, f_R and f_Q for every sample (128 x 4: sequences, iterations). In the
+same search the student's take {part_student}% of the expert's multiply-adds, one joint's
+{part_joint}%, but more of the time: small matrices are less efficient. With a processor each, a
+search takes one joint's time.
 """
 
 
@@ -606,7 +610,7 @@ def facts(found, config):
         "h_R": shares["reward"]["h"], "samples": SEARCH.samples, "elites": SEARCH.num_elites,
         "gain_all": f"{each.mean():.2f}",
         "gap": f"{(each - one).mean():.2f} ± {(each - one).std(ddof=1) / len(one) ** 0.5:.2f}",
-        "P": len(G), "P_last": len(G) - 1, "combinations": f"{G.size:,}", "each": grid["G_i"].size,
+        "P": len(G), "combinations": f"{G.size:,}", "each": grid["G_i"].size,
         "best": ", ".join(map(str, best)), "columns": len(set(rows.argmax(1))),
         "rank": f"{1 + (G > G[tuple(best)]).sum():,}",
         "r_joint": ", ".join(f"{r:.2f}" for r in credit["student r"]),
@@ -615,9 +619,10 @@ def facts(found, config):
 
 
 def filled(known):
-    """TEXT with its numbers, its paragraphs wrapped anew."""
-    return "\n\n".join(textwrap.fill(part, 100, break_on_hyphens=False)
-                       for part in TEXT.format(**known).split("\n\n")) + "\n"
+    """TEXT with its numbers, its paragraphs wrapped anew; formulas are indented."""
+    return "\n\n".join(part if part.startswith("    ") else
+                       textwrap.fill(part, 100, break_on_hyphens=False)
+                       for part in TEXT.format(**known).rstrip().split("\n\n")) + "\n"
 
 
 def command_tour(args):
