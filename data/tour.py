@@ -532,8 +532,7 @@ Equation 4:
 D is 0 only where both agree. A fresh student's last layers are zero: all copies seem alike.
 `distill_loss` adds up D of R_h and Q_h, weighted by lambda^h; `distill` follows its gradient. On
 held-out trajectories D of Q_0 falls from {D0_before} to {D0_after}, of Q_{H} from {DH_before} to
-{DH_after}. Rewards are hardly learned yet: the arm earns at its target only, so most copies earn
-alike.
+{DH_after}. Rewards are hardly learned yet: most copies earn alike.
 
 ## 4. Sums of shares
 
