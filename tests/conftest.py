@@ -14,7 +14,7 @@ SLOW = ("worker", "process", "hang", "parent", "learns_the_experts_order", "keep
 
 
 def pytest_addoption(parser):
-    parser.addoption("--fuzz", type=int, default=100, help="mutated files of each kind [100]")
+    parser.addoption("--fuzz", type=int, default=250, help="mutated files of each kind [250]")
     parser.addoption("--skipped", action="store_true", help="only what the last run skipped")
 
 
