@@ -1,5 +1,4 @@
-"""Tests of section 8: the command line as users run it, on a small expert and replay made here."""
-
+"""The command line as users run it, on a small expert and replay made here."""
 import csv
 import dataclasses
 import errno

@@ -1,5 +1,4 @@
-"""Tests of section 7 (weights, replay, files) and of `from_dict`, which reads their headers."""
-
+"""Files: weights, replays, and `from_dict`, which reads their headers."""
 import errno
 import json
 import os

@@ -1,5 +1,4 @@
-"""Tests of section 6: the paper's 11 tasks as MuJoCo really runs them, and hindsight targets."""
-
+"""Environments: the paper's 11 tasks as MuJoCo really runs them, one's own robots, hindsight."""
 import functools
 import os
 import subprocess

@@ -1170,6 +1170,8 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
     monkeypatch.setattr(fac, "recorded_returns", lambda *_: ([], ""))  # are of whole episodes
     monkeypatch.setattr(fac, "choose_by_playing", lambda distiller, task, taught, plannings, *_: (
         plannings[-2], []))  # narrow
+    monkeypatch.setattr(fac, "interleaved_seconds", lambda calls, *_: np.ones((1, len(calls))))
+    monkeypatch.setattr(fac, "draw_curve", lambda *_: True)
     monkeypatch.setattr(students, "time_both", lambda *_: {
         "plan_workers": 0, **{f"plan_ms_{who}": 1.0 for who in (
             "expert", "policy", "same_search", "student_in_process", "student")}})

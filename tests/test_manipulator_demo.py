@@ -11,16 +11,13 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-
-import fac_tdmpc_ref as fac  # noqa: E402
-import manipulator_demo as demo  # noqa: E402
+import fac_tdmpc_ref as fac
+import manipulator_demo as demo
+from toys import ROOT
 
 COLUMN_LOW, COLUMN_SPAN = demo.LOW[:, None], demo.SPAN[:, None]
 
