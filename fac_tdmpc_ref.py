@@ -173,9 +173,14 @@ def linear(x, W, b):
     return y
 
 
+def linear_dx(dy, W):
+    """dx = W^T dy of y = W x + b; BLAS is slow at the outer product that it is of a single row."""
+    return W.swapaxes(1, 2) @ dy if W.shape[1] > 1 else W.swapaxes(1, 2) * dy
+
+
 def linear_backward(dy, x, W):
     """Gradients of y = W x + b: dx = W^T dy, dW = dy x^T, db = sum over B of dy."""
-    return W.swapaxes(1, 2) @ dy, dy @ x.swapaxes(1, 2), dy.sum(2, keepdims=True)
+    return linear_dx(dy, W), dy @ x.swapaxes(1, 2), dy @ np.ones((dy.shape[2], 1), dy.dtype)
 
 
 def elu(x):
@@ -187,16 +192,15 @@ def elu(x):
 
 
 def elu_backward(dy, y):
-    """y = elu(x): dy/dx is 1 where y > 0, else exp(x) = y + 1. Overwrites y with dx."""
-    np.clip(y, -np.inf, 0, out=y)
-    y += 1
-    y *= dy
-    return y
+    """y = elu(x): dy/dx is 1 where y > 0, else exp(x) = y + 1. Overwrites dy with dx."""
+    dy *= np.clip(y, -np.inf, 0) + 1
+    return dy
 
 
 def tanh_backward(dy, y):
-    """y = tanh(x): dy/dx = 1 - y^2. Overwrites y with dx."""
-    return np.multiply(1 - y * y, dy, out=y)
+    """y = tanh(x): dy/dx = 1 - y^2. Overwrites dy with dx."""
+    dy *= 1 - y * y
+    return dy
 
 
 def standardize(x):
@@ -217,14 +221,10 @@ def norm_backward(dy, x, g):
     """Gradients of y = g x_hat + b. With u = g dy: dx = (u - mean(u) - x_hat mean(u x_hat)) scale,
     means over the features."""
     x_hat, scale = standardize(x)
-    db = dy.sum(2, keepdims=True)
-    dg = np.einsum("nfb,nfb->nf", dy, x_hat)[:, :, None]
-    dx = dy * g
-    x_hat *= np.einsum("nfb,nfb->nb", dx, x_hat)[:, None] / x.shape[1]
-    dx -= dx.mean(1, keepdims=True)
-    dx -= x_hat
+    dg, dx = np.einsum("nfb,nfb->nf", dy, x_hat)[:, :, None], dy * g
+    dx -= dx.mean(1, keepdims=True) + x_hat * (dx * x_hat).mean(1, keepdims=True)
     dx *= scale
-    return dx, dg, db
+    return dx, dg, dy.sum(2, keepdims=True)
 
 
 def forward(kinds, params, name, x, tape=None):
@@ -243,13 +243,11 @@ def forward(kinds, params, name, x, tape=None):
 
 
 def backward(kinds, params, name, tape, dy, grads):
-    """Walk `forward` back: adds parameter gradients to `grads` (None: not wanted), returns dx.
-
-    Uses the tape up: an activation's y, which only its own backward still reads, becomes its dx."""
+    """Walk `forward` back: adds parameter gradients to `grads` (None: not wanted), returns dx."""
     for i in reversed(range(len(kinds))):
         kind, x, y = kinds[i], tape[i], tape[i + 1]
         if kind == "linear" and grads is None:
-            dy = params[f"{name}.{i}.weight"].swapaxes(1, 2) @ dy
+            dy = linear_dx(dy, params[f"{name}.{i}.weight"])
         elif kind in ("linear", "norm"):
             layer_backward = linear_backward if kind == "linear" else norm_backward
             dy, dW, db = layer_backward(dy, x, params[f"{name}.{i}.weight"])
@@ -278,12 +276,14 @@ def flatten(arrays):
 
 class Adam:
     """Adam as PyTorch defines it, with clipping, on a dict of arrays: all of them views of one
-    vector, so that a step is a few vector calls. Add to `grads`, then `step`."""
+    vector, so that a step is a few calls a block. Add to `grads`, then `step`."""
 
     def __init__(self, arrays):
         self.vector, self.params = flatten(arrays)
         self.gradient, self.grads = flatten({k: np.zeros_like(v) for k, v in arrays.items()})
         self.m, self.v, self.t = np.zeros_like(self.vector), np.zeros_like(self.vector), 0
+        self.blocks = [[a[i:i + 16384] for a in (self.vector, self.gradient, self.m, self.v)]
+                       for i in range(0, len(self.vector), 16384)]  # what fits a core's cache
 
     def step(self, lr, clip=np.inf):
         """params -= lr m_hat / (sqrt(v_hat) + eps), of the gradient clipped to norm `clip`, which
@@ -292,11 +292,12 @@ class Adam:
         if length > clip:
             self.gradient *= self.gradient.dtype.type(clip / (length + 1e-6))  # PyTorch's 1e-6
         self.t += 1
-        self.m += (1 - beta1) * (self.gradient - self.m)
-        self.v += (1 - beta2) * (self.gradient ** 2 - self.v)
-        root = np.sqrt(self.v / (1 - beta2 ** self.t))
-        self.vector -= lr / (1 - beta1 ** self.t) * self.m / (root + eps)
-        self.gradient[:] = 0
+        for w, gradient, m, v in self.blocks:
+            m += (1 - beta1) * (gradient - m)
+            v += (1 - beta2) * (gradient ** 2 - v)
+            root = np.sqrt(v / (1 - beta2 ** self.t))
+            w -= lr / (1 - beta1 ** self.t) * m / (root + eps)
+            gradient[:] = 0
         return length
 
 
@@ -455,7 +456,7 @@ def heads_backward(model, tapes, d_shares, grads):
     n, dx = model.config.num_agents, 0
     for name, dy in zip(HEADS, d_shares):
         dy = np.repeat(dy, n // len(dy), 0).reshape(n, 1, -1)
-        dx = dx + model.backward(name, tapes[name], dy, grads)
+        dx += model.backward(name, tapes[name], dy, grads)
     return dx
 
 
@@ -903,28 +904,27 @@ def credit(expert, tapes, actions, predicted, sizes):
     What these leave of y_h,k - y_h,0 is shared evenly, so that the parts add up to it. For N = 1
     this is the joint target (a softmax ignores constants), but that both Q learn their mean.
 
-    expert: of one agent; tapes: of `unroll` and `run_heads` for its actions (L, A, B, K), used up;
+    expert: of one agent; tapes: of `unroll` and `run_heads` for its actions (L, A, B, K);
     predicted: three (L, B, K); sizes: the agents' ModelConfig. Returns the reward's parts
     (N, L, B, K) and, for each Q, those of both Q's mean, by which plans are ranked."""
     (L, A, B, K), m = actions.shape, expert.config.latent_dim
     half = np.full((1, 1, L * B * K), 0.5, actions.dtype)
     d_q = sum(expert.backward(name, tapes[name], half, None) for name in ("_Q1", "_Q2"))
     d_reward = expert.backward("_reward", tapes["_reward"], 2 * half, None)
-    dx, later = np.stack([d_reward[0], d_q[0]], 1).reshape(m + A, 2, L, B * K), None
-    way = actions - actions[..., :1]
-    parts = np.zeros((A, 2, L, B, K), actions.dtype)
+    dx = np.stack([d_reward[0], d_q[0]]).reshape(2, m + A, L, B * K)
+    way = (actions - actions[..., :1]) / 2
+    parts, d = np.zeros((L, 2, A, B, K), actions.dtype), dx[:0, :, 0]
     for j in reversed(range(L)):
-        d = dx[:, :, j:j + 1]  # of the outputs at h = j by (s_j, a_j); those at h > j come by s_j+1
-        if j < L - 1:
-            tape = [np.tile(y, 2 * (L - 1 - j)) for y in tapes[f"_dynamics {j}"]]
-            later = expert.backward("_dynamics", tape, later.reshape(1, m, -1), None)
-            d = np.concatenate([d, later.reshape(m + A, 2, L - 1 - j, -1)], 2)
-        later, g = d[:m], d[m:].reshape(A, 2, L - j, B, K)
-        parts[:, :, j:] += way[j][:, None, None] * (g + g[..., :1]) / 2
-    parts = parts[agent_order(sizes)].reshape(sizes.num_agents, -1, 2, L, B, K).sum(1)
-    y = np.stack([predicted[0], (predicted[1] + predicted[2]) / 2])
-    parts += (y - y[..., :1] - parts.sum(0)) / sizes.num_agents
-    return [parts[:, 0], parts[:, 1], parts[:, 1]]
+        if j < L - 1:  # of outputs at h > j, through s_j+1: each on the axis that agents have
+            d = expert.backward("_dynamics", tapes[f"_dynamics {j}"], d[:, :m], None)
+        d = np.concatenate([dx[:, :, j], d])  # by (s_j, a_j), of both outputs at h = j, j + 1, ...
+        g = d[:, m:].reshape(L - j, 2, A, B, K)
+        parts[j:] += way[j] * (g + g[..., :1])
+    parts = parts[:, :, agent_order(sizes)].reshape(L, 2, sizes.num_agents, -1, B, K).sum(3)
+    y = np.stack([predicted[0], (predicted[1] + predicted[2]) / 2], 1)
+    parts += (y - y[..., :1] - parts.sum(2))[:, :, None] / sizes.num_agents
+    reward, q = parts.transpose(1, 2, 0, 3, 4)
+    return [reward, q, q]
 
 
 def prior_optimizer(student):
@@ -1010,7 +1010,7 @@ def compact(rows):
     return half if (moved <= 0.01 * apart).all() else rows
 
 
-POOL, PART = 4096, 64  # states that the expert predicts at once, and a thread's part of them
+POOL, PART = 4096, 32  # states that the expert predicts at once, and a thread's part of them
 EXPERT_NOISE = 0.6  # largest deviation of the noise in episodes that its policy plays [D8]
 
 
@@ -1018,7 +1018,9 @@ class Distiller:
     """Algorithm 1: one `step` after the other, reproducible from the seed, and from `state`.
 
     The expert is frozen: what it predicts for a pool of states and their perturbed actions is
-    computed once and learned from `reuse` times; by two threads: NumPy's products hold no GIL.
+    computed once and learned from `reuse` times; a batch in two halves, a pool in parts, by as many
+    threads as there are cores, which changes no bit: NumPy's products hold no GIL. (Four parts of a
+    batch would take two cores 12% longer.)
     num_agents: N, or `groups`; sizes: replace `student_config`'s. UserError if expert, replay and
     config don't fit. A subclass may have its own `create`, `loss`, `perturb` and `ranks`."""
 
@@ -1052,9 +1054,10 @@ class Distiller:
         with one_thread():
             self.optimizer, self.student = self.create(expert, sizes, seed)
         self._number = None
-        self._threads = ThreadPoolExecutor(2, "", functools.partial(np.seterr, all="ignore"))
-        self._halves = [flatten({k: np.zeros_like(v) for k, v in self.optimizer.params.items()})
-                        for _ in range(2)]  # each thread's gradient: a vector, its parts by name
+        self._threads = ThreadPoolExecutor(min(4, cores()), "",
+                                           functools.partial(np.seterr, all="ignore"))
+        self._halves = [flatten(self.optimizer.params)  # of a batch, by two threads or by one
+                        for _ in range(2)]  # each one's gradient: a vector, its parts by name
 
     def draw(self, number, part, size):
         """Lines 4 and 6 (expert), `size` states, part `part` of a pool; as `perturb` returns."""
@@ -1091,23 +1094,24 @@ class Distiller:
 
     def step(self):
         """Lines 4 to 6 once. Returns loss, mean reward divergence, mean value divergence."""
-        size, total = self.config.batch_size, np.zeros(3)
-        parts = slice(0, size // 2), slice(size // 2, size)  # of a batch, one for each thread
+        size = self.config.batch_size
+        parts = slice(0, size // 2), slice(size // 2, size)
 
-        def learn(part, grads):
-            return self.loss(self.student, features[..., part], actions[:, :, part],
-                             [x[..., part, :] for x in targets], self.config, grads)
+        def learn(part, half):
+            (gradient, grads), fraction = half, (part.stop - part.start) / size
+            gradient[:] = 0
+            losses = self.loss(self.student, features[..., part], actions[:, :, part],
+                               [x[..., part, :] for x in targets], self.config, grads)
+            gradient *= gradient.dtype.type(fraction)
+            return fraction * np.array(losses)
 
         with one_thread():
             features, actions, targets = self.batch(self.t)
-            found = self._threads.map(learn, parts, (grads for _, grads in self._halves))
-            for part, (gradient, _), losses in zip(parts, self._halves, found):
-                fraction = (part.stop - part.start) / size
-                total += fraction * np.array(losses)
-                self.optimizer.gradient += gradient.dtype.type(fraction) * gradient
-                gradient[:] = 0
+            losses = sum(self._threads.map(learn, parts, self._halves))
+            self.optimizer.gradient += self._halves[0][0]
+            self.optimizer.gradient += self._halves[1][0]
             self.optimizer.step(learning_rate(self.config, self.t), self.config.grad_clip)
-        return tuple(total.tolist())
+        return tuple(losses.tolist())
 
     def run(self):
         """Algorithm 1 from here to its end; yields each step's losses. UserError if they diverge.
