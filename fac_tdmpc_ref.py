@@ -909,9 +909,8 @@ def credit(expert, tapes, actions, predicted, sizes):
     (N, L, B, K) and, for each Q, those of both Q's mean, by which plans are ranked."""
     (L, A, B, K), m = actions.shape, expert.config.latent_dim
     half = np.full((1, 1, L * B * K), 0.5, actions.dtype)
-    d_q = sum(expert.backward(name, tapes[name], half, None) for name in ("_Q1", "_Q2"))
-    d_reward = expert.backward("_reward", tapes["_reward"], 2 * half, None)
-    dx = np.stack([d_reward[0], d_q[0]]).reshape(2, m + A, L, B * K)
+    d_reward, *d_q = (expert.backward(name, tapes[name], half, None) for name in HEADS)
+    dx = np.concatenate([2 * d_reward, sum(d_q)]).reshape(2, m + A, L, B * K)
     way = (actions - actions[..., :1]) / 2
     parts, d = np.zeros((L, 2, A, B, K), actions.dtype), dx[:0, :, 0]
     for j in reversed(range(L)):
@@ -1018,9 +1017,7 @@ class Distiller:
     """Algorithm 1: one `step` after the other, reproducible from the seed, and from `state`.
 
     The expert is frozen: what it predicts for a pool of states and their perturbed actions is
-    computed once and learned from `reuse` times; a batch in two halves, a pool in parts, by as many
-    threads as there are cores, which changes no bit: NumPy's products hold no GIL. (Four parts of a
-    batch would take two cores 12% longer.)
+    computed once and learned from `reuse` times; by up to four threads, which change no bit.
     num_agents: N, or `groups`; sizes: replace `student_config`'s. UserError if expert, replay and
     config don't fit. A subclass may have its own `create`, `loss`, `perturb` and `ranks`."""
 
@@ -1054,10 +1051,8 @@ class Distiller:
         with one_thread():
             self.optimizer, self.student = self.create(expert, sizes, seed)
         self._number = None
-        self._threads = ThreadPoolExecutor(min(4, cores()), "",
-                                           functools.partial(np.seterr, all="ignore"))
-        self._halves = [flatten(self.optimizer.params)  # of a batch, by two threads or by one
-                        for _ in range(2)]  # each one's gradient: a vector, its parts by name
+        self._threads = ThreadPoolExecutor(min(4, cores()), "", lambda: np.seterr(all="ignore"))
+        self._halves = [flatten(self.optimizer.params) for _ in range(2)]  # a batch's two gradients
 
     def draw(self, number, part, size):
         """Lines 4 and 6 (expert), `size` states, part `part` of a pool; as `perturb` returns."""
@@ -1108,8 +1103,7 @@ class Distiller:
         with one_thread():
             features, actions, targets = self.batch(self.t)
             losses = sum(self._threads.map(learn, parts, self._halves))
-            self.optimizer.gradient += self._halves[0][0]
-            self.optimizer.gradient += self._halves[1][0]
+            np.add(*(gradient for gradient, _ in self._halves), out=self.optimizer.gradient)
             self.optimizer.step(learning_rate(self.config, self.t), self.config.grad_clip)
         return tuple(losses.tolist())
 
@@ -1232,11 +1226,11 @@ class Returns:
 
     Layers are homogeneous matrices: a bias costs no pass over the activations, and the row of
     ones goes through ELU unchanged. Networks with the same input share its first product
-    (dynamics with reward; both Q). The latent's part of that product is computed once a plan, as
-    all samples start from one latent. LayerNorm's mean and gain are folded into the weights."""
+    (dynamics with reward; both Q). The first latent's part of it is computed once a plan; later
+    ones are linear in a hidden layer, which is read in their place unless they are narrower."""
 
     def __init__(self, model):
-        self.sizes, p = model.config, model.params  # below, w is the hidden width
+        self.sizes, p, m = model.config, model.params, model.config.latent_dim  # w: hidden width
         first = homogeneous(p, "_dynamics.0", "_reward.0"), self._fold_norm(p)
         self.first = [W.reshape(len(W), -1, W.shape[3]) for W in first]  # (N, 2w + 2, m + d + 1)
         self.second = [homogeneous(p, "_dynamics.2", "_reward.2"),      # (N, 2, w + 1, w + 1)
@@ -1245,6 +1239,9 @@ class Returns:
             np.concatenate([p[f"{layer}.weight"], p[f"{layer}.bias"]], 2)
             for layer in ("_dynamics.4", "_reward.4", "_Q1.5", "_Q2.5"))
         self.to_q = np.concatenate(to_q, 2) / 2                         # (N, 1, 2w + 2)
+        skips = self.skips_latent = 3 * m > 2 * self.sizes.mlp_dim  # for 2 w^2 products, not 3 m w
+        self.later = [np.concatenate([W[..., :m] @ self.to_latent, W[..., m:]], 2) if skips else W
+                      for W in self.first]                              # (N, 2w + 2, w + d + 2)
 
     def _fold_norm(self, p):
         """First layers of both Q, after which LayerNorm is y / sqrt(spread @ y^2 + eps) + shift.
@@ -1253,10 +1250,9 @@ class Returns:
         `spread` takes the gains out of the variance again. The row of ones becomes zeros here,
         and 20 by `shift`, which tanh takes to 1."""
         W = homogeneous(p, "_Q1.0", "_Q2.0")
-        rows = W.shape[:3]
         W[:, :, -1] = 0
         W[:, :, :-1] -= W[:, :, :-1].mean(2, keepdims=True)
-        gain, self.shift = np.ones((*rows, 1), F32), np.full((*rows, 1), F32(20))
+        gain, self.shift = np.ones_like(W[..., :1]), np.full_like(W[..., :1], 20)
         for i, name in enumerate(("_Q1", "_Q2")):
             gain[:, i, :-1] = p[f"{name}.1.weight"]
             self.shift[:, i, :-1] = p[f"{name}.1.bias"]
@@ -1269,27 +1265,25 @@ class Returns:
         """Plan from the latent z (N, m, 1): at h = 0 the first products read (a, 1) only."""
         self.horizon, self.discount = config.horizon, config.discount
         m = self.sizes.latent_dim
-        self.first_at_start = [W[:, :, m:].copy() for W in self.first]  # (N, 2w + 2, d + 1)
-        for W, at_start in zip(self.first, self.first_at_start):
-            at_start[..., -1:] += W[:, :, :m] @ z
+        self.at_start = [np.concatenate([W[..., m:-1], W[..., -1:] + W[..., :m] @ z], 2)
+                         for W in self.first]                           # (N, 2w + 2, d + 1)
         return self
 
     def __call__(self, actions):
         """actions (N, L, d, S) -> G (N, S), in blocks of samples that fit the cache."""
-        size = 256 if self.sizes.mlp_dim >= 256 else 128  # OpenBLAS is fastest so
-        blocks = np.array_split(actions, max(1, round(actions.shape[-1] / size)), axis=-1)
+        blocks = np.array_split(actions, max(1, round(actions.shape[-1] / 256)), axis=-1)
         return np.concatenate([self._block(block) for block in blocks], 1)
 
     def _block(self, actions):
         """Equation 2 for a block of samples."""
-        m, half, G = self.sizes.latent_dim, self.sizes.mlp_dim + 1, F32(0)
-        x = np.ones((len(actions), m + actions.shape[2] + 1, actions.shape[-1]), F32)  # (z, a, 1)
+        half, d, G = self.sizes.mlp_dim + 1, actions.shape[2], F32(0)
+        x = np.ones((len(actions), self.later[0].shape[2], actions.shape[-1]), F32)  # (z, a, 1)
         for h in range(self.horizon + 1):
-            x[:, m:-1] = actions[:, h]
+            x[:, -d - 1:-1] = actions[:, h]
             if h < self.horizon:
                 y = self._hidden(0, h, x)
                 out = self.to_reward @ y[:, half:]
-                x[:, :m] = self.to_latent @ y[:, :half]
+                x[:, :-d - 1] = y[:, :half] if self.skips_latent else self.to_latent @ y[:, :half]
             else:
                 out = self.to_q @ self._hidden(1, h, x)
             G = G + F32(self.discount ** h) * out[:, 0]
@@ -1297,7 +1291,8 @@ class Returns:
 
     def _hidden(self, pair, h, x):
         """Both hidden layers of a pair of networks (0: dynamics and reward, 1: the two Q)."""
-        y = self.first[pair] @ x if h else self.first_at_start[pair] @ x[:, self.sizes.latent_dim:]
+        first = (self.later if h else self.at_start)[pair]
+        y = first @ x[:, -first.shape[2]:]
         y = self._norm_tanh(y) if pair else elu(y)
         after = self.second[pair] @ y.reshape(len(y), 2, -1, y.shape[2])
         return elu(after.reshape(y.shape))
