@@ -465,8 +465,8 @@ def unroll_backward(model, tapes, actions, dx, grads):
     (L, _, B, K), n, m = actions.shape, model.config.num_agents, model.config.latent_dim
     for h in reversed(range(L - 1)):
         now, after = (slice(i * B * K, (i + 1) * B * K) for i in (h, h + 1))
-        dx[:, :, now] += model.backward("_dynamics", tapes[f"_dynamics {h}"],
-                                        np.ascontiguousarray(dx[:, :m, after]), grads)
+        dx[:, :, now] += model.backward("_dynamics", tapes[f"_dynamics {h}"], dx[:, :m, after],
+                                        grads)
     return dx[:, :m, :B * K].reshape(n, m, B, K).sum(3)
 
 
