@@ -173,9 +173,14 @@ def linear(x, W, b):
     return y
 
 
+def linear_dx(dy, W):
+    """dx = W^T dy of y = W x + b; BLAS is slow at the outer product that it is of a single row."""
+    return W.swapaxes(1, 2) @ dy if W.shape[1] > 1 else W.swapaxes(1, 2) * dy
+
+
 def linear_backward(dy, x, W):
     """Gradients of y = W x + b: dx = W^T dy, dW = dy x^T, db = sum over B of dy."""
-    return W.swapaxes(1, 2) @ dy, dy @ x.swapaxes(1, 2), dy.sum(2, keepdims=True)
+    return linear_dx(dy, W), dy @ x.swapaxes(1, 2), dy @ np.ones((dy.shape[2], 1), dy.dtype)
 
 
 def elu(x):
@@ -187,16 +192,15 @@ def elu(x):
 
 
 def elu_backward(dy, y):
-    """y = elu(x): dy/dx is 1 where y > 0, else exp(x) = y + 1. Overwrites y with dx."""
-    np.clip(y, -np.inf, 0, out=y)
-    y += 1
-    y *= dy
-    return y
+    """y = elu(x): dy/dx is 1 where y > 0, else exp(x) = y + 1. Overwrites dy with dx."""
+    dy *= np.clip(y, -np.inf, 0) + 1
+    return dy
 
 
 def tanh_backward(dy, y):
-    """y = tanh(x): dy/dx = 1 - y^2. Overwrites y with dx."""
-    return np.multiply(1 - y * y, dy, out=y)
+    """y = tanh(x): dy/dx = 1 - y^2. Overwrites dy with dx."""
+    dy *= 1 - y * y
+    return dy
 
 
 def standardize(x):
@@ -217,14 +221,10 @@ def norm_backward(dy, x, g):
     """Gradients of y = g x_hat + b. With u = g dy: dx = (u - mean(u) - x_hat mean(u x_hat)) scale,
     means over the features."""
     x_hat, scale = standardize(x)
-    db = dy.sum(2, keepdims=True)
-    dg = np.einsum("nfb,nfb->nf", dy, x_hat)[:, :, None]
-    dx = dy * g
-    x_hat *= np.einsum("nfb,nfb->nb", dx, x_hat)[:, None] / x.shape[1]
-    dx -= dx.mean(1, keepdims=True)
-    dx -= x_hat
+    dg, dx = np.einsum("nfb,nfb->nf", dy, x_hat)[:, :, None], dy * g
+    dx -= dx.mean(1, keepdims=True) + x_hat * (dx * x_hat).mean(1, keepdims=True)
     dx *= scale
-    return dx, dg, db
+    return dx, dg, dy.sum(2, keepdims=True)
 
 
 def forward(kinds, params, name, x, tape=None):
@@ -243,13 +243,11 @@ def forward(kinds, params, name, x, tape=None):
 
 
 def backward(kinds, params, name, tape, dy, grads):
-    """Walk `forward` back: adds parameter gradients to `grads` (None: not wanted), returns dx.
-
-    Uses the tape up: an activation's y, which only its own backward still reads, becomes its dx."""
+    """Walk `forward` back: adds parameter gradients to `grads` (None: not wanted), returns dx."""
     for i in reversed(range(len(kinds))):
         kind, x, y = kinds[i], tape[i], tape[i + 1]
         if kind == "linear" and grads is None:
-            dy = params[f"{name}.{i}.weight"].swapaxes(1, 2) @ dy
+            dy = linear_dx(dy, params[f"{name}.{i}.weight"])
         elif kind in ("linear", "norm"):
             layer_backward = linear_backward if kind == "linear" else norm_backward
             dy, dW, db = layer_backward(dy, x, params[f"{name}.{i}.weight"])
@@ -278,12 +276,14 @@ def flatten(arrays):
 
 class Adam:
     """Adam as PyTorch defines it, with clipping, on a dict of arrays: all of them views of one
-    vector, so that a step is a few vector calls. Add to `grads`, then `step`."""
+    vector, so that a step is a few calls a block. Add to `grads`, then `step`."""
 
     def __init__(self, arrays):
         self.vector, self.params = flatten(arrays)
         self.gradient, self.grads = flatten({k: np.zeros_like(v) for k, v in arrays.items()})
         self.m, self.v, self.t = np.zeros_like(self.vector), np.zeros_like(self.vector), 0
+        self.blocks = [[a[i:i + 16384] for a in (self.vector, self.gradient, self.m, self.v)]
+                       for i in range(0, len(self.vector), 16384)]  # what fits a core's cache
 
     def step(self, lr, clip=np.inf):
         """params -= lr m_hat / (sqrt(v_hat) + eps), of the gradient clipped to norm `clip`, which
@@ -292,11 +292,12 @@ class Adam:
         if length > clip:
             self.gradient *= self.gradient.dtype.type(clip / (length + 1e-6))  # PyTorch's 1e-6
         self.t += 1
-        self.m += (1 - beta1) * (self.gradient - self.m)
-        self.v += (1 - beta2) * (self.gradient ** 2 - self.v)
-        root = np.sqrt(self.v / (1 - beta2 ** self.t))
-        self.vector -= lr / (1 - beta1 ** self.t) * self.m / (root + eps)
-        self.gradient[:] = 0
+        for w, gradient, m, v in self.blocks:
+            m += (1 - beta1) * (gradient - m)
+            v += (1 - beta2) * (gradient ** 2 - v)
+            root = np.sqrt(v / (1 - beta2 ** self.t))
+            w -= lr / (1 - beta1 ** self.t) * m / (root + eps)
+            gradient[:] = 0
         return length
 
 
@@ -455,7 +456,7 @@ def heads_backward(model, tapes, d_shares, grads):
     n, dx = model.config.num_agents, 0
     for name, dy in zip(HEADS, d_shares):
         dy = np.repeat(dy, n // len(dy), 0).reshape(n, 1, -1)
-        dx = dx + model.backward(name, tapes[name], dy, grads)
+        dx += model.backward(name, tapes[name], dy, grads)
     return dx
 
 
@@ -464,8 +465,8 @@ def unroll_backward(model, tapes, actions, dx, grads):
     (L, _, B, K), n, m = actions.shape, model.config.num_agents, model.config.latent_dim
     for h in reversed(range(L - 1)):
         now, after = (slice(i * B * K, (i + 1) * B * K) for i in (h, h + 1))
-        dx[:, :, now] += model.backward("_dynamics", tapes[f"_dynamics {h}"],
-                                        np.ascontiguousarray(dx[:, :m, after]), grads)
+        dx[:, :, now] += model.backward("_dynamics", tapes[f"_dynamics {h}"], dx[:, :m, after],
+                                        grads)
     return dx[:, :m, :B * K].reshape(n, m, B, K).sum(3)
 
 
@@ -903,28 +904,26 @@ def credit(expert, tapes, actions, predicted, sizes):
     What these leave of y_h,k - y_h,0 is shared evenly, so that the parts add up to it. For N = 1
     this is the joint target (a softmax ignores constants), but that both Q learn their mean.
 
-    expert: of one agent; tapes: of `unroll` and `run_heads` for its actions (L, A, B, K), used up;
+    expert: of one agent; tapes: of `unroll` and `run_heads` for its actions (L, A, B, K);
     predicted: three (L, B, K); sizes: the agents' ModelConfig. Returns the reward's parts
     (N, L, B, K) and, for each Q, those of both Q's mean, by which plans are ranked."""
     (L, A, B, K), m = actions.shape, expert.config.latent_dim
     half = np.full((1, 1, L * B * K), 0.5, actions.dtype)
-    d_q = sum(expert.backward(name, tapes[name], half, None) for name in ("_Q1", "_Q2"))
-    d_reward = expert.backward("_reward", tapes["_reward"], 2 * half, None)
-    dx, later = np.stack([d_reward[0], d_q[0]], 1).reshape(m + A, 2, L, B * K), None
-    way = actions - actions[..., :1]
-    parts = np.zeros((A, 2, L, B, K), actions.dtype)
+    d_reward, *d_q = (expert.backward(name, tapes[name], half, None) for name in HEADS)
+    dx = np.concatenate([2 * d_reward, sum(d_q)]).reshape(2, m + A, L, B * K)
+    way = (actions - actions[..., :1]) / 2
+    parts, d = np.zeros((L, 2, A, B, K), actions.dtype), dx[:0, :, 0]
     for j in reversed(range(L)):
-        d = dx[:, :, j:j + 1]  # of the outputs at h = j by (s_j, a_j); those at h > j come by s_j+1
-        if j < L - 1:
-            tape = [np.tile(y, 2 * (L - 1 - j)) for y in tapes[f"_dynamics {j}"]]
-            later = expert.backward("_dynamics", tape, later.reshape(1, m, -1), None)
-            d = np.concatenate([d, later.reshape(m + A, 2, L - 1 - j, -1)], 2)
-        later, g = d[:m], d[m:].reshape(A, 2, L - j, B, K)
-        parts[:, :, j:] += way[j][:, None, None] * (g + g[..., :1]) / 2
-    parts = parts[agent_order(sizes)].reshape(sizes.num_agents, -1, 2, L, B, K).sum(1)
-    y = np.stack([predicted[0], (predicted[1] + predicted[2]) / 2])
-    parts += (y - y[..., :1] - parts.sum(0)) / sizes.num_agents
-    return [parts[:, 0], parts[:, 1], parts[:, 1]]
+        if j < L - 1:  # of outputs at h > j, through s_j+1: each on the axis that agents have
+            d = expert.backward("_dynamics", tapes[f"_dynamics {j}"], d[:, :m], None)
+        d = np.concatenate([dx[:, :, j], d])  # by (s_j, a_j), of both outputs at h = j, j + 1, ...
+        g = d[:, m:].reshape(L - j, 2, A, B, K)
+        parts[j:] += way[j] * (g + g[..., :1])
+    parts = parts[:, :, agent_order(sizes)].reshape(L, 2, sizes.num_agents, -1, B, K).sum(3)
+    y = np.stack([predicted[0], (predicted[1] + predicted[2]) / 2], 1)
+    parts += (y - y[..., :1] - parts.sum(2))[:, :, None] / sizes.num_agents
+    reward, q = parts.transpose(1, 2, 0, 3, 4)
+    return [reward, q, q]
 
 
 def prior_optimizer(student):
@@ -1010,7 +1009,7 @@ def compact(rows):
     return half if (moved <= 0.01 * apart).all() else rows
 
 
-POOL, PART = 4096, 64  # states that the expert predicts at once, and a thread's part of them
+POOL, PART = 4096, 32  # states that the expert predicts at once, and a thread's part of them
 EXPERT_NOISE = 0.6  # largest deviation of the noise in episodes that its policy plays [D8]
 
 
@@ -1018,7 +1017,7 @@ class Distiller:
     """Algorithm 1: one `step` after the other, reproducible from the seed, and from `state`.
 
     The expert is frozen: what it predicts for a pool of states and their perturbed actions is
-    computed once and learned from `reuse` times; by two threads: NumPy's products hold no GIL.
+    computed once and learned from `reuse` times; by up to four threads, which change no bit.
     num_agents: N, or `groups`; sizes: replace `student_config`'s. UserError if expert, replay and
     config don't fit. A subclass may have its own `create`, `loss`, `perturb` and `ranks`."""
 
@@ -1052,9 +1051,8 @@ class Distiller:
         with one_thread():
             self.optimizer, self.student = self.create(expert, sizes, seed)
         self._number = None
-        self._threads = ThreadPoolExecutor(2, "", functools.partial(np.seterr, all="ignore"))
-        self._halves = [flatten({k: np.zeros_like(v) for k, v in self.optimizer.params.items()})
-                        for _ in range(2)]  # each thread's gradient: a vector, its parts by name
+        self._threads = ThreadPoolExecutor(min(4, cores()), "", lambda: np.seterr(all="ignore"))
+        self._halves = [flatten(self.optimizer.params) for _ in range(2)]  # a batch's two gradients
 
     def draw(self, number, part, size):
         """Lines 4 and 6 (expert), `size` states, part `part` of a pool; as `perturb` returns."""
@@ -1091,23 +1089,23 @@ class Distiller:
 
     def step(self):
         """Lines 4 to 6 once. Returns loss, mean reward divergence, mean value divergence."""
-        size, total = self.config.batch_size, np.zeros(3)
-        parts = slice(0, size // 2), slice(size // 2, size)  # of a batch, one for each thread
+        size = self.config.batch_size
+        parts = slice(0, size // 2), slice(size // 2, size)
 
-        def learn(part, grads):
-            return self.loss(self.student, features[..., part], actions[:, :, part],
-                             [x[..., part, :] for x in targets], self.config, grads)
+        def learn(part, half):
+            (gradient, grads), fraction = half, (part.stop - part.start) / size
+            gradient[:] = 0
+            losses = self.loss(self.student, features[..., part], actions[:, :, part],
+                               [x[..., part, :] for x in targets], self.config, grads)
+            gradient *= gradient.dtype.type(fraction)
+            return fraction * np.array(losses)
 
         with one_thread():
             features, actions, targets = self.batch(self.t)
-            found = self._threads.map(learn, parts, (grads for _, grads in self._halves))
-            for part, (gradient, _), losses in zip(parts, self._halves, found):
-                fraction = (part.stop - part.start) / size
-                total += fraction * np.array(losses)
-                self.optimizer.gradient += gradient.dtype.type(fraction) * gradient
-                gradient[:] = 0
+            losses = sum(self._threads.map(learn, parts, self._halves))
+            np.add(*(gradient for gradient, _ in self._halves), out=self.optimizer.gradient)
             self.optimizer.step(learning_rate(self.config, self.t), self.config.grad_clip)
-        return tuple(total.tolist())
+        return tuple(losses.tolist())
 
     def run(self):
         """Algorithm 1 from here to its end; yields each step's losses. UserError if they diverge.
@@ -1228,11 +1226,11 @@ class Returns:
 
     Layers are homogeneous matrices: a bias costs no pass over the activations, and the row of
     ones goes through ELU unchanged. Networks with the same input share its first product
-    (dynamics with reward; both Q). The latent's part of that product is computed once a plan, as
-    all samples start from one latent. LayerNorm's mean and gain are folded into the weights."""
+    (dynamics with reward; both Q). The first latent's part of it is computed once a plan; later
+    ones are linear in a hidden layer, which is read in their place unless they are narrower."""
 
     def __init__(self, model):
-        self.sizes, p = model.config, model.params  # below, w is the hidden width
+        self.sizes, p, m = model.config, model.params, model.config.latent_dim  # w: hidden width
         first = homogeneous(p, "_dynamics.0", "_reward.0"), self._fold_norm(p)
         self.first = [W.reshape(len(W), -1, W.shape[3]) for W in first]  # (N, 2w + 2, m + d + 1)
         self.second = [homogeneous(p, "_dynamics.2", "_reward.2"),      # (N, 2, w + 1, w + 1)
@@ -1241,6 +1239,9 @@ class Returns:
             np.concatenate([p[f"{layer}.weight"], p[f"{layer}.bias"]], 2)
             for layer in ("_dynamics.4", "_reward.4", "_Q1.5", "_Q2.5"))
         self.to_q = np.concatenate(to_q, 2) / 2                         # (N, 1, 2w + 2)
+        skips = self.skips_latent = 3 * m > 2 * self.sizes.mlp_dim  # for 2 w^2 products, not 3 m w
+        self.later = [np.concatenate([W[..., :m] @ self.to_latent, W[..., m:]], 2) if skips else W
+                      for W in self.first]                              # (N, 2w + 2, w + d + 2)
 
     def _fold_norm(self, p):
         """First layers of both Q, after which LayerNorm is y / sqrt(spread @ y^2 + eps) + shift.
@@ -1249,10 +1250,9 @@ class Returns:
         `spread` takes the gains out of the variance again. The row of ones becomes zeros here,
         and 20 by `shift`, which tanh takes to 1."""
         W = homogeneous(p, "_Q1.0", "_Q2.0")
-        rows = W.shape[:3]
         W[:, :, -1] = 0
         W[:, :, :-1] -= W[:, :, :-1].mean(2, keepdims=True)
-        gain, self.shift = np.ones((*rows, 1), F32), np.full((*rows, 1), F32(20))
+        gain, self.shift = np.ones_like(W[..., :1]), np.full_like(W[..., :1], 20)
         for i, name in enumerate(("_Q1", "_Q2")):
             gain[:, i, :-1] = p[f"{name}.1.weight"]
             self.shift[:, i, :-1] = p[f"{name}.1.bias"]
@@ -1265,27 +1265,25 @@ class Returns:
         """Plan from the latent z (N, m, 1): at h = 0 the first products read (a, 1) only."""
         self.horizon, self.discount = config.horizon, config.discount
         m = self.sizes.latent_dim
-        self.first_at_start = [W[:, :, m:].copy() for W in self.first]  # (N, 2w + 2, d + 1)
-        for W, at_start in zip(self.first, self.first_at_start):
-            at_start[..., -1:] += W[:, :, :m] @ z
+        self.at_start = [np.concatenate([W[..., m:-1], W[..., -1:] + W[..., :m] @ z], 2)
+                         for W in self.first]                           # (N, 2w + 2, d + 1)
         return self
 
     def __call__(self, actions):
         """actions (N, L, d, S) -> G (N, S), in blocks of samples that fit the cache."""
-        size = 256 if self.sizes.mlp_dim >= 256 else 128  # OpenBLAS is fastest so
-        blocks = np.array_split(actions, max(1, round(actions.shape[-1] / size)), axis=-1)
+        blocks = np.array_split(actions, max(1, round(actions.shape[-1] / 256)), axis=-1)
         return np.concatenate([self._block(block) for block in blocks], 1)
 
     def _block(self, actions):
         """Equation 2 for a block of samples."""
-        m, half, G = self.sizes.latent_dim, self.sizes.mlp_dim + 1, F32(0)
-        x = np.ones((len(actions), m + actions.shape[2] + 1, actions.shape[-1]), F32)  # (z, a, 1)
+        half, d, G = self.sizes.mlp_dim + 1, actions.shape[2], F32(0)
+        x = np.ones((len(actions), self.later[0].shape[2], actions.shape[-1]), F32)  # (z, a, 1)
         for h in range(self.horizon + 1):
-            x[:, m:-1] = actions[:, h]
+            x[:, -d - 1:-1] = actions[:, h]
             if h < self.horizon:
                 y = self._hidden(0, h, x)
                 out = self.to_reward @ y[:, half:]
-                x[:, :m] = self.to_latent @ y[:, :half]
+                x[:, :-d - 1] = y[:, :half] if self.skips_latent else self.to_latent @ y[:, :half]
             else:
                 out = self.to_q @ self._hidden(1, h, x)
             G = G + F32(self.discount ** h) * out[:, 0]
@@ -1293,7 +1291,8 @@ class Returns:
 
     def _hidden(self, pair, h, x):
         """Both hidden layers of a pair of networks (0: dynamics and reward, 1: the two Q)."""
-        y = self.first[pair] @ x if h else self.first_at_start[pair] @ x[:, self.sizes.latent_dim:]
+        first = (self.later if h else self.at_start)[pair]
+        y = first @ x[:, -first.shape[2]:]
         y = self._norm_tanh(y) if pair else elu(y)
         after = self.second[pair] @ y.reshape(len(y), 2, -1, y.shape[2])
         return elu(after.reshape(y.shape))

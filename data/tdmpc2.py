@@ -58,9 +58,8 @@ def simnorm(x, group=GROUP):
 
 def simnorm_backward(dy, x, group=GROUP):
     """dx = y (dy - sum of y dy over the group)."""
-    shape = 1, -1, group, x.shape[2]
-    y, dy = simnorm(x, group).reshape(shape), dy.reshape(shape)
-    return (y * (dy - (y * dy).sum(2, keepdims=True))).reshape(x.shape)
+    y, d = (a.reshape(len(a), -1, group, x.shape[2]) for a in (simnorm(x, group), dy))
+    return (y * (d - (y * d).sum(2, keepdims=True))).reshape(dy.shape)
 
 
 def bins(x):

@@ -1,17 +1,20 @@
-"""NumPy against PyTorch on one machine, in one run: `python tests/bench_peer.py [--json]`.
+"""NumPy against PyTorch on one machine, in one run: `python tests/bench_peer.py [--record]`.
 
 The same models, the same MPPI and the same distillation step, written plainly in PyTorch
 (eager, `inference_mode`; batched `baddbmm` for the agents; `torch.compile` where it works); a
 decision also in JAX, compiled as a whole (pip install -e '.[peers]').
 Both take turns, so that noise hits both; figures are medians of NumPy's time over PyTorch's in
 the same turn, below 1 is faster. Sizes are section 5.1's (latent and hidden 512 // N), MPPI is
-Table 2's (512 samples, 6 iterations, horizon 3).
+Table 2's (512 samples, 6 iterations, horizon 3). `--record` keeps the ratios to eager PyTorch in
+data/results/bench.csv, in place of this machine's earlier ones.
 """
 import argparse
 import contextlib
+import csv
 import functools
 import json
 import os
+import platform
 import sys
 import time
 from pathlib import Path
@@ -261,9 +264,9 @@ class TorchDistiller:
 
 
 def distillation(threads, turns):
-    """(ratio, our ms, PyTorch's ms) of a distillation step: reacher-hard, default settings.
-
-    One core, or two. `reuse` is 1: both compute the expert's predictions for every step.
+    """(ratio, our ms, PyTorch's ms) of a distillation step: reacher-hard, Algorithm 1 with default
+    sizes, on one core, or two. Both compute the expert's predictions for every step: ours has a
+    pool for each turn of 20.
     """
     expert, _ = fac.load_model(fac.data_file("reacher-hard", "expert.npz"))
     replay = fac.Replay(fac.data_file("reacher-hard", "replay.npz"))
@@ -271,8 +274,9 @@ def distillation(threads, turns):
     os.sched_setaffinity(0, list(cores)[:threads])
     torch.set_num_threads(threads)
     try:
-        with contextlib.closing(fac.Distiller(expert, replay,
-                                               fac.DistillConfig(reuse=1))) as ours:
+        config = fac.DistillConfig(targets="joint", policy_share=0.0, reuse=1)
+        with contextlib.closing(fac.Distiller(expert, replay, config)) as ours:
+            ours.pool_size = 20 * config.batch_size
             theirs = TorchDistiller(ours, replay)
             return ratios(lambda: [ours.step() for _ in range(20)],
                           lambda: [theirs.step() for _ in range(20)], turns)
@@ -294,26 +298,61 @@ def training(threads, turns, batch=256):
                         for learner in (ours, theirs)), turns)
 
 
+def machine():
+    """(processor, cores, BLAS kernel), which a ratio is of."""
+    info = Path("/proc/cpuinfo").read_text() if os.path.exists("/proc/cpuinfo") else ""
+    names = [line.partition(": ")[2] for line in info.splitlines() if line.startswith("model name")]
+    kernels = {f"{pool['internal_api']} {pool.get('architecture', '')}".strip()
+               for pool in fac._thread_pools().info() if pool["user_api"] == "blas"}
+    return (names or [platform.processor()])[0], str(fac.cores()), ", ".join(sorted(kernels))
+
+
+def record(rows, path=ROOT / "data" / "results" / "bench.csv"):
+    """Keep (what, ratio) of this machine, in place of what the file has of it."""
+    kept = []
+    if path.exists():
+        with open(path, newline="", encoding="utf-8") as file:
+            kept = [row for row in list(csv.reader(file))[1:] if tuple(row[:3]) != machine()]
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows(
+            [("processor", "cores", "blas", "what", "ratio"), *kept,
+             *((*machine(), what, f"{ratio:.2f}") for what, ratio in rows)])
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--turns", type=functools.partial(fac.natural, least=1), default=9,
                         help="of each comparison [9]")
     parser.add_argument("--json", action="store_true", help="print one JSON object as last line")
+    parser.add_argument("--record", action="store_true",
+                        help="keep the ratios to eager PyTorch in data/results/bench.csv")
     args = parser.parse_args()
     result = {"central_ratio": None, "fac_ratio": {}, "jax_ratio": {}, "distill_ratio": {},
-              "update_ratio": {},
-              "cores": fac.cores(), "torch": torch.__version__, "numpy": np.__version__}
+              "update_ratio": {}, "machine": machine(), "torch": torch.__version__,
+              "numpy": np.__version__}
+    print("{}, {} cores, BLAS {}".format(*machine()), flush=True)
+    rows = []  # (what, ratio)
 
     def show(what, found, threads=1, peer="PyTorch"):
         per = 20 if what.startswith("distillation") else 1
-        print(f"{what:<42}{threads} thread{'s' * (threads > 1):<2} NumPy {found[1] / per:7.1f} ms"
+        many = f"{threads} thread{'s' * (threads > 1)}"
+        print(f"{what:<42}{many:<10} NumPy {found[1] / per:7.1f} ms"
               f"  {peer} {found[2] / per:7.1f} ms  ratio {found[0]:.2f}", flush=True)
+        rows.append((f"{what}, {many}", found[0]))
         return found[0]
 
     result["central_ratio"] = show("plan, TD-MPC (N = 1, latent 512)", planning(1, 6, args.turns))
     for n in (3, 6, 12, 21):
         result["fac_ratio"][str(n)] = show(f"plan, Fac-TDMPC (N = {n})", planning(n, n, args.turns))
     cores = os.sched_getaffinity(0)
+    for threads in (1, 2):
+        if threads <= len(cores):
+            result["distill_ratio"][str(threads)] = show(
+                "distillation step", distillation(threads, args.turns), threads)
+            result["update_ratio"][str(threads)] = show(
+                "update of TD-MPC (batch 256)", training(threads, args.turns), threads)
+    if args.record:
+        record(rows)
     os.sched_setaffinity(0, list(cores)[:1])  # JAX's own threads, too, begin on this one core
     for n in (1, 6, 21):
         found = planning(n, max(n, 6), args.turns, jax=True)
@@ -325,12 +364,6 @@ def main():
             show(f"plan, N = {n}, torch.compile", planning(n, 6, args.turns, compiled=True))
         except Exception as error:  # no compiler on this machine, for one
             print(f"torch.compile, N = {n}: does not work here ({type(error).__name__})")
-    for threads in (1, 2):
-        if threads <= len(os.sched_getaffinity(0)):
-            result["distill_ratio"][str(threads)] = show(
-                "distillation step", distillation(threads, args.turns), threads)
-            result["update_ratio"][str(threads)] = show(
-                "update of TD-MPC (batch 256)", training(threads, args.turns), threads)
     if args.json:
         print(json.dumps(result))
 

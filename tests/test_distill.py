@@ -289,6 +289,18 @@ def test_with_credit_a_state_s_first_copy_is_not_perturbed(replay):
     assert (joint[..., 0] != policy).mean() > 0.8
 
 
+def test_the_number_of_threads_changes_no_bit(replay, monkeypatch):
+    monkeypatch.setattr(fac, "PART", 16)  # of a pool: four parts
+    config, found = fac.dataclasses.replace(CONFIG, batch_size=5, steps=48, reuse=4), []
+    for threads in (1, 2, 4):
+        with fresh(replay, config) as distiller:
+            distiller._threads.shutdown()
+            distiller._threads = fac.ThreadPoolExecutor(threads)
+            losses = [distiller.step() for _ in range(15)]
+            found.append((losses, distiller.optimizer.vector.tobytes()))
+    assert found[0] == found[1] == found[2]
+
+
 @pytest.mark.parametrize("batch", [2, 5, 16])
 def test_a_step_in_halves_is_the_step_of_the_whole(replay, batch):
     config = fac.dataclasses.replace(CONFIG, batch_size=batch, warmup=0, grad_clip=1e9)
