@@ -61,16 +61,6 @@ def test_stdout(flags, unbuffered):
     assert done.stderr == "x: error: [Errno 28] No space left on device\n"
 
 
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
-@pytest.mark.parametrize("out", ["/dev/full", "/dev/null"])
-def test_stderr(out):
-    """Full, or read by a head that is gone: the exit status is the same, with or without a word."""
-    with open("/dev/full", "w") as full, open(out, "w") as stdout:
-        done = subprocess.run([sys.executable, ROOT / "fac_tdmpc_ref.py", "evaluate", "--model",
-                               "nowhere.npz"], stdout=stdout, stderr=full)
-    assert done.returncode == 2
-
-
 def test_distill(tmp_path, files):
     command = distill_arguments(files)
     for size in (50, 1000):
