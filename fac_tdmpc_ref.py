@@ -752,15 +752,11 @@ def check_finite(name, value, update, lr):
          f"learning diverged; lower the learning rate ({lr})")
 
 
-def divisors(n):
-    """The numbers of agents that can share n action dimensions."""
-    return [i for i in range(1, n + 1) if n % i == 0]
-
-
 def episode_steps(action_repeat):
     """T for this many control steps a decision; UserError if an episode doesn't divide by it."""
-    need(action_repeat in divisors(CONTROL_STEPS), f"action_repeat: expected a divisor of "
-         f"{CONTROL_STEPS}, dm_control's episode (for any robot), found {action_repeat!r}")
+    need(action_repeat in range(1, CONTROL_STEPS + 1) and CONTROL_STEPS % action_repeat == 0,
+         f"action_repeat: expected a divisor of {CONTROL_STEPS} (for any robot), found "
+         f"{action_repeat!r}")
     return CONTROL_STEPS // action_repeat
 
 
@@ -796,14 +792,14 @@ def rules(config):
                 yield f.name, holds(value, bounds[bound]), f"{words} {bounds[bound]}"
         object.__setattr__(config, f.name, cls(value))
     if isinstance(config, ModelConfig):
-        agents, each = divisors(config.dim_action), map(str, range(config.dim_action))
+        A, each = config.dim_action, map(str, range(config.dim_action))
+        agents = [n for n in range(1, A + 1) if A % n == 0]
         yield ("num_agents", config.num_agents in agents,
-               f"one of {agents}, as {config.dim_action} action dimensions are shared evenly")
+               f"one of {agents}, as {A} action dimensions are shared evenly")
         groups = [group.split(",") for group in config.groups.split("/")]
         alike = len(groups) == config.num_agents and len({len(group) for group in groups}) == 1
         yield ("groups", not config.groups or alike and sorted(sum(groups, [])) == sorted(each),
-               "equally many action dimensions for each agent (one array holds all), each of 0 to "
-               f"{config.dim_action - 1} once, as --agents 0,2/1,3")
+               f"equally many for each agent, each of 0 to {A - 1} once, as --agents 0,2/1,3")
     elif isinstance(config, PlannerConfig):
         T = episode_steps(config.action_repeat)
         yield "horizon", config.horizon < T, f"below {T}, an episode's decisions"
@@ -1115,17 +1111,14 @@ class Distiller:
         return self.optimizer.t
 
     def add(self, observation, action):
-        """Let episodes (E, T, O), (E, T, A), NaN past their ends, join `played`, the rows
+        """Let episodes (E, T, O), (E, T, A), as `play` returns them, join `played`, the rows
         (all, O + A) of episodes of `lengths` [D8]; those of H decisions or fewer are left out."""
         episodes, L = np.concatenate([observation, action], 2), self.config.horizon + 1
-        good = np.isfinite(observation).all(2) & (np.abs(action) <= 1).all(2)
-        past = np.logical_and.accumulate(np.isnan(episodes).all(2)[:, ::-1], 1)[:, ::-1]
-        for e, t in np.argwhere(~(good | past))[:1]:
-            raise UserError(f"played episodes: {e}, decision {t}: not finite, or outside [-1, 1]")
-        long = good.sum(1) >= L
+        lived = np.isfinite(episodes).all(2)
+        long = lived.sum(1) >= L
         need(long.any(), f"played episodes: none has {L} decisions, one more than the horizon")
-        self.played = np.concatenate([self.played, compact(episodes[long][good[long]])])
-        self.lengths = np.concatenate([self.lengths, good[long].sum(1)])
+        self.played = np.concatenate([self.played, compact(episodes[long][lived[long]])])
+        self.lengths = np.concatenate([self.lengths, lived[long].sum(1)])
         self._number = None  # its pool is drawn again, with them
 
     def state(self):
@@ -1166,8 +1159,8 @@ class PlainDistiller(Distiller):
     def __init__(self, expert, replay, config, num_agents=None, seed=0):
         need((config.targets, config.policy_share, config.expert_episodes, config.reuse,
               config.priors, isinstance(num_agents, str)) == ("joint", 0, 0, 1, False, False),
-             "--plain is Algorithm 1 alone: without --targets, --policy-share, "
-             "--expert-episodes, --reuse and --priors, and with --num-agents for --agents")
+             "--plain goes without --targets, --policy-share, --expert-episodes, --reuse, --priors "
+             "and --agents")
         super().__init__(expert, replay, config, num_agents, seed)
         self._plain = distill(expert, replay, config, self.student.config.num_agents, seed)
 
@@ -1628,19 +1621,14 @@ def robot_step(robot, action, sizes, t):
     return obs, reward, any(ends), any(ends[:1])
 
 
+@functools.cache
 def lookup_task(task):
     """(domain, name, dim O, dim A) of a task; UserError with the nearest name otherwise."""
-    task = str(task)
-    return *task.split(":" if is_gym(task) else "-", 1), *robot_sizes(task)
-
-
-@functools.cache
-def robot_sizes(task):
-    """(dim O, dim A) of a task; UserError: it is none, or its episodes can't be played."""
-    if task in TASKS:
-        return TASKS[task]
-    with contextlib.closing(make_robot(task)) as robot:  # the one that plays may need what it holds
-        return robot.dim_obs, robot.dim_action
+    dims = TASKS.get(task)
+    if not dims:
+        with contextlib.closing(make_robot(task)) as robot:  # what it holds may be needed to play
+            dims = robot.dim_obs, robot.dim_action
+    return *task.split(":" if is_gym(task) else "-", 1), *dims
 
 
 def episode_seeds(seed, episodes, first=0):
@@ -1792,8 +1780,8 @@ class Replay:
     """The dataset of Algorithm 1 [D6]: transitions in order, episode after episode.
 
     observation (M, O) and action (M, A) float16 or float32, continues (M,): False in an episode's
-    last row, whose action stands for nothing. Raises UserError for anything else, and for a file
-    that names another action repeat than `repeat`, the expert's, if given."""
+    last row, whose action stands for nothing. UserError for anything else, and for a file of
+    another action repeat than `repeat`, the expert's, if given."""
 
     def __init__(self, path, repeat=None):
         self.path = path
@@ -1802,9 +1790,8 @@ class Replay:
                                  ("action", 2, "float16, float32")):
             value = arrays.get(key, np.zeros(0, object))
             need(value.ndim == rank and str(value.dtype) in kinds.split(", ")
-                 and len(value) == len(arrays["observation"]),
-                 f"{path}: {key}: expected {kinds} of rank {rank} with a row for each "
-                 f"transition, found {f'{value.dtype} {value.shape}' if value.size else 'nothing'}")
+                 and len(value) == len(arrays["observation"]), f"{path}: {key}: expected {kinds} "
+                 f"of rank {rank}, a row a transition, found {value.dtype} {value.shape}")
             if rank == 2:
                 check_rows(f"{path}: {key}", value, 1 if key == "action" else None)
         self.observation, self.action = arrays["observation"], arrays["action"]
@@ -1905,8 +1892,7 @@ def _playing_worker(connection):
 def play(model, task, config, seeds, workers=None, label="playing", environment=None, noise=0.0,
          teacher=None):
     """Plan through the episodes of `seeds`: observations (E, T, O), actions (E, T, A), rewards
-    (E, T) and seconds of planning (E, T). T is the longest episode's; past a shorter one's end they
-    are NaN, its rewards 0.
+    (E, T), seconds of planning (E, T); NaN past the end of one shorter than the longest, rewards 0.
 
     workers: processes that share the episodes [one for each core]; 0, or with an `environment`: all
     in this one. An episode depends on its seed, not on their number. environment: instead of the
@@ -2199,7 +2185,7 @@ def read_records(path):
         records = json.loads(path.read_text(encoding="utf-8")) if os.path.exists(path) else {}
         return {key: ([float(r) for r in about["returns"]], dict(about["versions"]))
                 for key, about in records.items()}
-    except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+    except Exception as error:  # a user's own file can raise nearly anything
         raise UserError(f"{path}: not what evaluate --record writes ({error}); rename it") from None
 
 

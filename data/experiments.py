@@ -924,7 +924,8 @@ def make_parser():
     sub.add_argument("--decisions", type=positive,
                      help="of training, a multiple of 2000 [30000; walker-walk: 48000]")
     add_runs("figure13", lambda args: distil_and_time(args, lambda task: [
-        (f"N = {n}", {"num_agents": n}) for n in fac.divisors(fac.lookup_task(task)[3])]),
+        (f"N = {n}", {"num_agents": n}) for n in range(1, fac.lookup_task(task)[3] + 1)
+        if fac.lookup_task(task)[3] % n == 0]),
              "Appendix C.2: the number of agents; returns, then milliseconds (keep the machine "
              "quiet for these).", walkers, **curve)
     for sub in map(commands.choices.get, ("figure4", "figure7", "figure13")):

@@ -434,7 +434,7 @@ def test_a_mujoco_of_another_version_is_explained(monkeypatch):
         "wrapper"].mjbindings.sizes.array_sizes["mjmodel"]
     monkeypatch.setitem(sizes, "of_another_version", ("nv",))
     for make in (lambda: fac.Environment("reacher-hard"), lambda: fac.Environment("walker-walk"),
-                 lambda: fac.robot_sizes.__wrapped__("cartpole-swingup")):
+                 lambda: fac.lookup_task.__wrapped__("cartpole-swingup")):
         with pytest.raises(fac.UserError, match="of_another_version.*mujoco==3.17.0 beside dm-con"):
             make()
 
