@@ -76,7 +76,6 @@ def test_train_expert(tmp_path):
 
 
 def test_experiments(tmp_path):
-    pytest.importorskip("joblib")
     command = ["sweep", *SMALL, "--set", *SET]
     full_disk("sweep.csv", 20, "data/experiments.py", *command, cwd=tmp_path)
     assert experiments.read_rows(tmp_path / "sweep.csv") == []
