@@ -258,7 +258,7 @@ def test_wrong_header(tmp_path, expert_file, changes, parts):
 
 
 @pytest.mark.parametrize("changes, parts", [
-    ({"width": 3}, ("unknown setting 'width'", "mlp_dim")),
+    ({"width": 3}, ("'width'",)),
     ({"num_agents": "3"}, ("num_agents", "int", "'3'")),
     ({"latent_dim": 5.5}, ("latent_dim", "int", "5.5")),
     ({"num_agents": 4}, ("num_agents must be one of [1, 2, 3, 6]", "not 4")),
@@ -389,7 +389,7 @@ def test_whole_numbers_will_do_for_decimal_ones():
 
 
 @pytest.mark.parametrize("values, parts", [
-    ({"sample": 3}, ("unknown setting 'sample'", "samples", "horizon")),
+    ({"sample": 3}, ("'sample'",)),
     ({"samples": "3"}, ("samples", "'3'")),
     ({"samples": None}, ("samples", "None")),
     ({"samples": 4, "elites": 5}, ("elites must be at most samples (4), not 5",)),
