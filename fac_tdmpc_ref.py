@@ -2285,7 +2285,8 @@ def distil_and_save(distiller, args, planning, header, out):
         model, about = load_model(path, ["student"])
         same_settings({key: about.get(key) for key in settings}, settings, path)
         student.params.update(prior_weights(model))
-        planning, played = planning_of(about, path, args, speed=planning.speed), about["played"]
+        planning = planning_of(about, path, args, speed=planning.speed)
+        played = about.get("played", [])
     need(finished or not config.priors or planning.prior == "own", "--plan-prior last: expected "
          "--no-priors, or a run whose search is chosen: give the command without it first")
     Planner(student, planning)  # what it lacks is missed now
