@@ -716,7 +716,6 @@ import sys
 import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from multiprocessing import resource_tracker
 from pathlib import Path
 
 __version__ = "0.1.0"  # to be raised where plans change: recorded returns name it
@@ -754,15 +753,11 @@ def check_finite(name, value, update, lr):
          f"learning diverged; lower the learning rate ({lr})")
 
 
-def divisors(n):
-    """The numbers of agents that can share n action dimensions."""
-    return [i for i in range(1, n + 1) if n % i == 0]
-
-
 def episode_steps(action_repeat):
     """T for this many control steps a decision; UserError if an episode doesn't divide by it."""
-    need(action_repeat in divisors(CONTROL_STEPS), f"action_repeat: expected a divisor of "
-         f"{CONTROL_STEPS}, dm_control's episode (for any robot), found {action_repeat!r}")
+    need(action_repeat in range(1, CONTROL_STEPS + 1) and CONTROL_STEPS % action_repeat == 0,
+         f"action_repeat: expected a divisor of {CONTROL_STEPS} (for any robot), found "
+         f"{action_repeat!r}")
     return CONTROL_STEPS // action_repeat
 
 
@@ -774,47 +769,38 @@ def seed_sequence(seed, **options):
         raise UserError(f"seed: expected a whole number of 0 or more, found {seed!r}") from None
 
 
-RANGE = {"least": ("at least {}", operator.ge), "above": ("above {}", operator.gt),
-         "most": ("at most {}", operator.le),
-         "choices": ("one of {}", lambda value, choices: value in choices)}
+RANGE = {"least": ("at least", operator.ge), "above": ("above", operator.gt),
+         "most": ("at most", operator.le), "choices": ("one of", lambda value, of: value in of)}
 
 
 def check_settings(config):
     """UserError for a type or a value that a config's field rules out, and for two that don't go
     together. 1 becomes 1.0 where a float is meant, and NumPy's numbers Python's."""
+    for name, holds, rule in rules(config):
+        value = getattr(config, name)
+        need(holds, f"{type(config).__name__}: {name} must be {rule}, not {value!r}")
+
+
+def rules(config):
+    """(field, whether it holds, rule) of what a config's values have to fulfil: each, then all."""
     for f in dataclasses.fields(config):
         value, cls = getattr(config, f.name), type(f.default)
-        kinds = {int: "iu", float: "iuf", bool: "b"}.get(cls, "U")
-        need_setting(config, f.name, np.dtype(type(value)).kind in kinds, f"of type {cls.__name__}")
-        rules = [(words.format(f.metadata[bound]), holds(value, f.metadata[bound]))
-                 for bound, (words, holds) in RANGE.items() if bound in f.metadata]
-        if cls is float:
-            rules.append(("finite, as a float32", abs(value) < 3e38))
-        elif cls is int and value > 10 ** 9:
-            rules.append(("at most 10^9", False))
-        need_setting(config, f.name, all(holds for _, holds in rules),
-                     " and ".join(words for words, _ in rules))
+        kinds = {int: "iu", float: "iuf", bool: "b", str: "U"}[cls]
+        yield f.name, np.dtype(type(value)).kind in kinds, f"of type {cls.__name__}"
+        bounds = {**{int: {"most": 10 ** 9}, float: {"most": 3e38}}.get(cls, {}), **f.metadata}
+        for bound, (words, holds) in RANGE.items():
+            if bound in bounds:
+                yield f.name, holds(value, bounds[bound]), f"{words} {bounds[bound]}"
         object.__setattr__(config, f.name, cls(value))
-    for name, holds, rule in rules_together(config):
-        need_setting(config, name, holds, rule)
-
-
-def need_setting(config, name, holds, rule):
-    """UserError for the value of a config's field `name` unless it holds what a rule says."""
-    need(holds, f"{type(config).__name__}: {name} must be {rule}, not {getattr(config, name)!r}")
-
-
-def rules_together(config):
-    """(field, whether it holds, rule) of what a config's values have to fulfil together."""
     if isinstance(config, ModelConfig):
-        agents, each = divisors(config.dim_action), map(str, range(config.dim_action))
+        A, each = config.dim_action, map(str, range(config.dim_action))
+        agents = [n for n in range(1, A + 1) if A % n == 0]
         yield ("num_agents", config.num_agents in agents,
-               f"one of {agents}, as {config.dim_action} action dimensions are shared evenly")
+               f"one of {agents}, as {A} action dimensions are shared evenly")
         groups = [group.split(",") for group in config.groups.split("/")]
         alike = len(groups) == config.num_agents and len({len(group) for group in groups}) == 1
         yield ("groups", not config.groups or alike and sorted(sum(groups, [])) == sorted(each),
-               "equally many action dimensions for each agent (one array holds all), each of 0 to "
-               f"{config.dim_action - 1} once, as --agents 0,2/1,3")
+               f"equally many for each agent, each of 0 to {A - 1} once, as --agents 0,2/1,3")
     elif isinstance(config, PlannerConfig):
         T = episode_steps(config.action_repeat)
         yield "horizon", config.horizon < T, f"below {T}, an episode's decisions"
@@ -827,14 +813,10 @@ def rules_together(config):
 
 
 def from_dict(config_class, values, where):
-    """A config from a dict, e.g. a file's header; unknown keys are refused, too."""
-    known = [f.name for f in dataclasses.fields(config_class)]
-    need(isinstance(values, dict), f"{where}: expected settings, found {values!r}")
-    for key in values:
-        need(key in known, f"{where}: unknown setting {key!r}; expected some of {', '.join(known)}")
+    """A config from a dict, e.g. a file's header; what is none, and unknown keys, are refused."""
     try:
         return config_class(**values)
-    except UserError as error:
+    except (UserError, TypeError) as error:  # Python's own words for a key that it doesn't know
         raise UserError(f"{where}: {error}") from None
 
 
@@ -1123,17 +1105,14 @@ class Distiller:
         return self.optimizer.t
 
     def add(self, observation, action):
-        """Let episodes (E, T, O), (E, T, A), NaN past their ends, join `played`, the rows
+        """Let episodes (E, T, O), (E, T, A), as `play` returns them, join `played`, the rows
         (all, O + A) of episodes of `lengths` [D8]; those of H decisions or fewer are left out."""
         episodes, L = np.concatenate([observation, action], 2), self.config.horizon + 1
-        good = np.isfinite(observation).all(2) & (np.abs(action) <= 1).all(2)
-        past = np.logical_and.accumulate(np.isnan(episodes).all(2)[:, ::-1], 1)[:, ::-1]
-        for e, t in np.argwhere(~(good | past))[:1]:
-            raise UserError(f"played episodes: {e}, decision {t}: not finite, or outside [-1, 1]")
-        long = good.sum(1) >= L
+        lived = np.isfinite(episodes).all(2)
+        long = lived.sum(1) >= L
         need(long.any(), f"played episodes: none has {L} decisions, one more than the horizon")
-        self.played = np.concatenate([self.played, compact(episodes[long][good[long]])])
-        self.lengths = np.concatenate([self.lengths, good[long].sum(1)])
+        self.played = np.concatenate([self.played, compact(episodes[long][lived[long]])])
+        self.lengths = np.concatenate([self.lengths, lived[long].sum(1)])
         self._number = None  # its pool is drawn again, with them
 
     def state(self):
@@ -1174,8 +1153,8 @@ class PlainDistiller(Distiller):
     def __init__(self, expert, replay, config, num_agents=None, seed=0):
         need((config.targets, config.policy_share, config.expert_episodes, config.reuse,
               config.priors, isinstance(num_agents, str)) == ("joint", 0, 0, 1, False, False),
-             "--plain is Algorithm 1 alone: without --targets, --policy-share, "
-             "--expert-episodes, --reuse and --priors, and with --num-agents for --agents")
+             "--plain goes without --targets, --policy-share, --expert-episodes, --reuse, --priors "
+             "and --agents")
         super().__init__(expert, replay, config, num_agents, seed)
         self._plain = distill(expert, replay, config, self.student.config.num_agents, seed)
 
@@ -1350,15 +1329,12 @@ def cores():
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-NO_ARRAY = TypeError, ValueError, RuntimeError  # of what NumPy can't take; the last is PyTorch's
-
-
 def checked(values, shape, what, dtype=F32):
     """A finite copy, of this shape, of values: a robot may use its array again. UserError: none."""
     try:
         with np.errstate(all="ignore"):  # what is too large is infinite
             found = np.array(values, dtype)
-    except NO_ARRAY:
+    except (TypeError, ValueError, RuntimeError):  # the last is PyTorch's
         raise UserError(f"{what}: expected numbers of shape {shape}, found {shown(values)}, of "
                         "which NumPy makes no array") from None
     need(found.shape == shape, f"{what}: expected shape {shape}, found {found.shape}")
@@ -1381,8 +1357,8 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
     def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
         self.model, self.config, sequence = model, config, seed_sequence(seed)
         need(config.prior == "last" or model.has_policy or model.config.prior_steps,
-             "the model has no prior for plans to begin from: it is a student distilled without, "
-             "or an expert without a policy; pass --plan-prior last (evaluate: --prior last)")
+             "the model has no prior for plans to begin from (an expert: no policy); pass "
+             "--plan-prior last (evaluate: --prior last)")
         self._parts = split_agents(model.config.num_agents, workers)
         own, *others = ((some_agents(model, part.start, part.stop), config) for part in self._parts)
         self.own = FastPlanner(*own)
@@ -1444,36 +1420,27 @@ class Workers(contextlib.AbstractContextManager):
 
     def __init__(self, target, count, name="worker"):
         context, self._name, self._members = multiprocessing.get_context("spawn"), name, []
-        usual = None, *multiprocessing.get_all_start_methods()
-        need(not count or not multiprocessing.current_process().daemon and
-             multiprocessing.get_start_method(True) in usual, "daemonic processes, as a "
-             "multiprocessing.Pool's, and joblib's can't start workers: pass workers=0")
         if getattr(main := sys.modules["__main__"], "__file__", "") == "<stdin>":
             del main.__file__  # or children look for it
         try:
             for _ in range(count):
                 here, there = context.Pipe()
                 process = context.Process(target=_run_worker, args=(target, there), daemon=True)
-                resource_tracker.ensure_running()  # or `start` does it, which unblocks SIGINT
-                signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a child inherits it
                 process.start()
                 there.close()
                 self._members.append((process, here))
-        except (AttributeError, pickle.PicklingError, OSError) as error:
+        except (AssertionError, AttributeError, pickle.PicklingError, OSError) as error:
             self.close()
-            raise UserError(f"no process can be started ({error}): pass workers=0 (--workers 0), "
-                            "use no debugger or profiler, or raise a limit (ulimit -a)") from None
-        finally:
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+            raise UserError(f"no process can be started ({error}), as in a pool's, under a "
+                            "debugger, at a limit (ulimit -a): pass workers=0 (--workers 0)"
+                            ) from None
 
     def send_all(self, messages):
         """Send one of the messages to each worker, in their order."""
         for i, ((_, connection), message) in enumerate(zip(self._members, messages)):
-            if connection.closed:
-                raise WorkerError(f"{self._name} {i} was stopped before; start anew")
             try:  # plain pickle: Connection.send's own takes half of a hand-over's time
                 connection.send_bytes(pickle.dumps(message))
-            except (BrokenPipeError, ConnectionResetError):
+            except OSError:  # it has died, or was stopped
                 while True:  # past answers left unread, to what it ended with
                     self.receive(i)
 
@@ -1484,8 +1451,8 @@ class Workers(contextlib.AbstractContextManager):
             message = connection.recv()
         except (EOFError, OSError):  # also in the middle of a message
             process.join(1)
-            message = WorkerError(f"{self._name} {i} ended with exit code {process.exitcode}; "
-                                  f"the others were stopped")
+            message = WorkerError(f"{self._name} {i} ended with exit code {process.exitcode}; all "
+                                  "are stopped, start anew")
         if isinstance(message, Exception):
             self.close()
             raise message
@@ -1509,6 +1476,7 @@ class Workers(contextlib.AbstractContextManager):
 
 
 def _run_worker(target, connection):
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     with contextlib.suppress(EOFError, ConnectionError), one_thread():  # the parent is gone
         try:
             target(connection)
@@ -1529,17 +1497,15 @@ REACHER = DATA / "reacher.xml"  # three links; dm_control's has two
 
 
 def import_dm_control(render=False):
-    """dm_control's suite, rl.control, suite.reacher. Nothing else here imports MuJoCo. The first
-    import of a process decides whether dm_control can draw."""
+    """dm_control's suite. Nothing else here imports MuJoCo. The first import of a process decides
+    whether dm_control can draw."""
     backend = os.environ.get("MUJOCO_GL")
     try:
         import mujoco  # noqa: F401  (whose own renderer is the caller's)
         if backend is None and not render:
             os.environ["MUJOCO_GL"] = "disable"  # states only: dm_control needs no display
         from dm_control import suite
-        from dm_control.rl import control
-        from dm_control.suite import reacher
-        reacher.Physics.from_xml_string("<mujoco/>")  # MuJoCo's of other versions import, and fail
+        suite.reacher.Physics.from_xml_string("<mujoco/>")  # other versions' import, and fail here
     except Exception as error:
         raise UserError(f"dm_control does not import ({error}); it needs mujoco==3.17.0 beside "
                         f"dm-control==1.0.50, and MUJOCO_GL unset or one of egl, osmesa, disable "
@@ -1547,7 +1513,7 @@ def import_dm_control(render=False):
     finally:
         if backend is None:
             os.environ.pop("MUJOCO_GL", None)
-    return suite, control, reacher
+    return suite
 
 
 def is_gym(task):
@@ -1585,14 +1551,13 @@ class Environment:
 
     def __init__(self, task, action_repeat=ACTION_REPEAT, render=False):
         self.action_repeat, self.episode_steps = action_repeat, episode_steps(action_repeat)
-        need(not is_gym(task), f"{task}: Gymnasium's; expected one of dm_control's here")
-        suite, control, reacher = import_dm_control(render)
+        suite = import_dm_control(render)
         domain, _, name = str(task).partition("-")
         if task in TASKS and domain == "reacher":
             need(REACHER.exists(), f"{REACHER}: no such file; run from a clone of the repository")
-            self.env = control.Environment(
-                reacher.Physics.from_xml_string(REACHER.read_text("ascii")),
-                reacher.Reacher(REACHER_TARGET[name], random=0), time_limit=20)
+            self.env = suite.reacher.control.Environment(
+                suite.reacher.Physics.from_xml_string(REACHER.read_text("ascii")),
+                suite.reacher.Reacher(REACHER_TARGET[name], random=0), time_limit=20)
         else:
             known = [*TASKS, *map("-".join, suite.ALL_TASKS)]
             near = [] if task in known else difflib.get_close_matches(str(task), known, 1, 0)
@@ -1635,50 +1600,30 @@ class Environment:
         return self._observation(timestep), reward
 
 
-def ask(method, value, where):
-    """What a robot's `reset` or `step` answers; UserError: what it raised."""
-    try:
-        return method(value)
-    except (Exception, SystemExit) as error:
-        need(isinstance(error, UserError), f"{where}: the robot raised {shown(error)}")
-        raise
-
-
 def robot_step(robot, action, sizes, t):
     """Decision t of an episode: next observation (O,), reward, whether it is over, and whether by
-    its state, beyond which nothing is worth anything: a robot's third value, if any; a fourth tells
-    that the time is over. dm_control's reward of None: the next episode has begun, and all of this
-    is none of ours. What goes to and fro is copied. UserError: what isn't finite."""
-    answer = ask(robot.step, np.array(action), f"decision {t}")
-    need(isinstance(answer, (tuple, list)) and 1 < len(answer) < 5 and all(
-        np.asarray(end).size == 1 and end in (False, True) for end in answer[2:]), f"decision "
-        f"{t}: expected (observation, reward), or also, True or False, whether the state ended "
-        f"the episode, and whether the time did; found {shown(answer)}")
-    obs, reward, *ends = answer
+    its state, so that later value is zero: a robot's third value, if any; a fourth tells that the
+    time is over. dm_control's reward of None: the next episode has begun. What goes to and fro is
+    copied. UserError: what isn't finite."""
+    obs, reward, *ends = robot.step(np.array(action))
+    need(len(ends) < 3 and all(end in (False, True) for end in ends), f"decision {t}: expected "
+         "(observation, reward), or also, True or False, whether the state ended the episode, and "
+         f"whether the time did; found {shown((obs, reward, *ends))}")
     if reward is None and t:
         return None, None, True, False
-    try:
-        number = np.asarray(reward, float).item()  # None is NaN
-    except NO_ARRAY:
-        number = np.nan
-    need(np.isfinite(number), f"decision {t}: expected a finite reward, found {shown(reward)}")
+    reward = checked(np.squeeze(reward), (), f"decision {t}: reward", float).item()
     obs = checked(obs, (sizes.dim_obs,), f"decision {t}: observation")
-    return obs, number, any(ends), any(ends[:1])
-
-
-def lookup_task(task):
-    """(domain, name, dim O, dim A) of a task; UserError with the nearest name otherwise."""
-    task = str(task)
-    return *task.split(":" if is_gym(task) else "-", 1), *robot_sizes(task)
+    return obs, reward, any(ends), any(ends[:1])
 
 
 @functools.cache
-def robot_sizes(task):
-    """(dim O, dim A) of a task; UserError: it is none, or its episodes can't be played."""
-    if task in TASKS:
-        return TASKS[task]
-    with contextlib.closing(make_robot(task)) as robot:  # the one that plays may need what it holds
-        return robot.dim_obs, robot.dim_action
+def lookup_task(task):
+    """(domain, name, dim O, dim A) of a task; UserError with the nearest name otherwise."""
+    dims = TASKS.get(task)
+    if not dims:
+        with contextlib.closing(make_robot(task)) as robot:  # what it holds may be needed to play
+            dims = robot.dim_obs, robot.dim_action
+    return *task.split(":" if is_gym(task) else "-", 1), *dims
 
 
 def episode_seeds(seed, episodes, first=0):
@@ -1696,8 +1641,6 @@ def training_seeds(seed, use, first, count):
 # ==== 11. Files: weights, replay, records =============================================
 
 FORMAT = "fac-tdmpc-ref 1"
-MADE = ("files are made by distill, data/train_expert.py and, of others' checkpoints and data, "
-        "data/import_expert.py")
 
 
 @contextlib.contextmanager
@@ -1734,8 +1677,8 @@ def locked(path, folder=True, wait=False):
     with contextlib.ExitStack() as stack:
         try:
             import fcntl
-            mode = os.O_RDONLY if folder or not os.access(path, os.W_OK) else os.O_RDWR  # for NFS
-            stack.callback(os.close, handle := os.open(path, mode))
+            handle = os.open(path, os.O_RDONLY if folder else os.O_RDWR)  # as NFS wants files
+            stack.callback(os.close, handle)
             fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError:
             raise UserError(f"{path}: another run is writing into it; wait for its end, or choose "
@@ -1757,20 +1700,17 @@ def read_npz(path, kinds):
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {key: np.asarray(file[key]) for key in file.files}
+        header = dict(json.loads(arrays.pop("header").tobytes()))
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
     except Exception as error:  # a damaged file can raise nearly anything
         reason = " ".join(str(error).split()).split(". ")[0]  # NumPy advises to load it unsafely
-        raise UserError(f"{path}: not a readable .npz file ({reason}); {MADE}") from None
-    header = None
-    with contextlib.suppress(KeyError, ValueError, RecursionError):
-        header = json.loads(arrays.pop("header").tobytes())
-    need(isinstance(header, dict), f"{path}: header: expected a JSON entry of this name, found "
-         f"none; {MADE}")
-    need(header.get("format") == FORMAT, f"{path}: header: format: expected {FORMAT!r}, found "
-         f"{header.get('format')!r}; a newer version's file needs that version of this project")
-    need(header.get("kind") in kinds, f"{path}: header: kind: expected {' or '.join(kinds)!r}, "
-         f"found {header.get('kind')!r}")
+        raise UserError(f"{path}: not a readable .npz file with a JSON header ({reason}); files "
+                        "are made by distill, data/train_expert.py and, of others' checkpoints "
+                        "and data, data/import_expert.py") from None
+    for key, expected in (("format", (FORMAT,)), ("kind", kinds)):
+        need(header.get(key) in expected, f"{path}: header: {key}: expected "
+             f"{' or '.join(expected)!r}, found {header.get(key)!r}")
     return header, arrays
 
 
@@ -1790,8 +1730,7 @@ def load_model(path, kinds=("expert", "student")):
     """(model, header) of one of these kinds. UserError names file, key, expected and found."""
     header, arrays = read_npz(path, kinds)
     if isinstance(header.get("model"), dict):
-        need(not header["model"].pop("expert_mlp_dim", 0), f"{path}: header: model: a student of "
-             "an earlier version, which held its expert's policy; distil it again")
+        header["model"].pop("expert_mlp_dim", 0)  # earlier versions wrote that there is none
     config = from_dict(ModelConfig, header.get("model"), f"{path}: header: model")
     params, policy = {}, config.num_agents == 1 and "_pi.0.weight" in arrays
     for name, i, kind, shape, _ in layers(config, policy):
@@ -1799,12 +1738,9 @@ def load_model(path, kinds=("expert", "student")):
             key = f"{name}.{i}.{part}"
             on_disk = expected if kind == "linear" and part == "weight" else expected[:2]
             on_disk = on_disk[1:] if expected[0] == 1 else on_disk
-            value = arrays.pop(key, None)
-            need(value is not None, f"{path}: {key}: missing; expected float32 {on_disk}")
-            need(value.shape == on_disk, f"{path}: {key}: expected float32 {on_disk}, found "
-                 f"{value.dtype} {value.shape}; the header's sizes and the weights disagree")
-            need(value.dtype in (F32, np.float16), f"{path}: {key}: expected float32, found "
-                 f"{value.dtype}; data/import_expert.py converts it")
+            value = arrays.pop(key, np.zeros(0, object))
+            need(value.shape == on_disk and value.dtype in (F32, np.float16),
+                 f"{path}: {key}: expected float32 {on_disk}, found {value.dtype} {value.shape}")
             need(np.isfinite(value).all(), f"{path}: {key}: holds values that are not finite")
             params[key] = np.ascontiguousarray(value.reshape(expected), F32)
     need(not arrays, f"{path}: {next(iter(arrays), None)}: unknown entry; expected TD-MPC's "
@@ -1815,17 +1751,16 @@ def load_model(path, kinds=("expert", "student")):
 def made_for(header, where):
     """What a model's file was trained, or distilled, for, as settings of a PlannerConfig: discount,
     horizon, SEARCH and the header's action repeat, where it names them. Nothing else reads them."""
-    found, there = {}, f"{where}: header"
-    for group, names in (("training", ("discount", "horizon")), ("distill", ("horizon",)),
-                         ("planner", ("discount", "horizon", *SEARCH))):
+    found = {}
+    for group, names in (("training", ()), ("distill", ()), ("planner", SEARCH)):
         settings = header.get(group) or {}
-        need(isinstance(settings, dict), f"{there}: {group}: expected settings, found {settings!r}")
-        settings = {name: settings[name] for name in names if name in settings}
-        from_dict(PlannerConfig, settings, f"{there}: {group}")
-        found.update(settings)
+        need(isinstance(settings, dict), f"{where}: header: {group}: expected settings, found "
+             f"{settings!r}")
+        found.update({name: settings[name] for name in ("discount", "horizon", *names)
+                      if name in settings})
     if "action_repeat" in header or is_gym(header.get("task")):
         found["action_repeat"] = header.get("action_repeat", task_repeat(header.get("task")))
-    from_dict(PlannerConfig, found, there)
+    from_dict(PlannerConfig, found, f"{where}: header")
     return found
 
 
@@ -1840,8 +1775,8 @@ class Replay:
     """The dataset of Algorithm 1 [D6]: transitions in order, episode after episode.
 
     observation (M, O) and action (M, A) float16 or float32, continues (M,): False in an episode's
-    last row, whose action stands for nothing. Raises UserError for anything else, and for a file
-    that names another action repeat than `repeat`, the expert's, if given."""
+    last row, whose action stands for nothing. UserError for anything else, and for a file of
+    another action repeat than `repeat`, the expert's, if given."""
 
     def __init__(self, path, repeat=None):
         self.path = path
@@ -1850,9 +1785,8 @@ class Replay:
                                  ("action", 2, "float16, float32")):
             value = arrays.get(key, np.zeros(0, object))
             need(value.ndim == rank and str(value.dtype) in kinds.split(", ")
-                 and len(value) == len(arrays["observation"]),
-                 f"{path}: {key}: expected {kinds} of rank {rank} with a row for each "
-                 f"transition, found {f'{value.dtype} {value.shape}' if value.size else 'nothing'}")
+                 and len(value) == len(arrays["observation"]), f"{path}: {key}: expected {kinds} "
+                 f"of rank {rank}, a row a transition, found {value.dtype} {value.shape}")
             if rank == 2:
                 check_rows(f"{path}: {key}", value, 1 if key == "action" else None)
         self.observation, self.action = arrays["observation"], arrays["action"]
@@ -1905,10 +1839,8 @@ def data_file(task, name):
     """data/experts/TASK/<name>; UserError that says what to do if it isn't there."""
     lookup_task(task)
     path = EXPERTS / task / name
-    if not path.exists():
-        shipped = ", ".join(sorted(p.parent.name for p in EXPERTS.glob("*/expert.npz"))) or "none"
-        raise UserError(f"{path}: no such file; the repository holds {shipped}. Train one with "
-                        f"'python data/train_expert.py --task {task}', give --expert, --replay")
+    need(path.exists(), f"{path}: no such file; train an expert with 'python data/train_expert.py "
+         f"--task {task}', and give --expert, --replay")
     return path
 
 
@@ -1924,12 +1856,10 @@ def episodes_of(model, task, config, seeds, environment, noise, teacher):
         return
     planners, sizes = [Planner(model, of) for of in (config, teacher) if of], model.config
     T = getattr(environment, "episode_steps", episode_steps(config.action_repeat))
-    need(isinstance(T, (int, np.integer)) and T > 0, "the robot's episode_steps: expected a whole "
-         f"number above 0, found {T!r}")
     for seed in seeds:
         for planner in planners:
             planner.reset(seed)
-        obs = checked(ask(environment.reset, seed, "reset"), (sizes.dim_obs,), "reset: observation")
+        obs = checked(environment.reset(seed), (sizes.dim_obs,), "reset: observation")
         rng, decisions = stream(seed, "exploration"), []
         deviation = F32(rng.uniform(0, noise))
         for t in range(T):
@@ -1957,8 +1887,7 @@ def _playing_worker(connection):
 def play(model, task, config, seeds, workers=None, label="playing", environment=None, noise=0.0,
          teacher=None):
     """Plan through the episodes of `seeds`: observations (E, T, O), actions (E, T, A), rewards
-    (E, T) and seconds of planning (E, T). T is the longest episode's; past a shorter one's end they
-    are NaN, its rewards 0.
+    (E, T), seconds of planning (E, T); NaN past the end of one shorter than the longest, rewards 0.
 
     workers: processes that share the episodes [one for each core]; 0, or with an `environment`: all
     in this one. An episode depends on its seed, not on their number. environment: instead of the
@@ -2001,10 +1930,9 @@ def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="eval
 
 def check_task(sizes, task, what="the model"):
     """UserError if what has these sizes (a ModelConfig, a Replay) isn't for the task."""
-    _, _, *dims = lookup_task(task)
-    need(dims == [sizes.dim_obs, sizes.dim_action],
-         f"{what} has (dim O, dim A) = ({sizes.dim_obs}, {sizes.dim_action}), {task} has "
-         f"({dims[0]}, {dims[1]}); name the task it was made for")
+    found, expected = (sizes.dim_obs, sizes.dim_action), lookup_task(task)[2:]
+    need(found == expected, f"{what} has (dim O, dim A) = {found}, {task} has {expected}; name the "
+         "task it was made for")
 
 
 def progress(label, total, unit, initial=0):
@@ -2147,20 +2075,16 @@ CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correla
 
 def train_student(distiller, out, settings, planning, workers):
     """Algorithm 1 to its end, with a learning curve and checkpoints in the folder `out`, from which
-    a run that was cut off goes on to the same end (UserError: one is damaged, or another run's).
+    a run that was cut off goes on to the same end (UserError: one is another run's).
     workers: that play the expert's episodes [D8]. Returns curve rows, seconds, those before."""
     checkpoint, config, curve, before = out / "checkpoint.npz", distiller.config, [], 0.0
     if checkpoint.exists():
         header, arrays = read_npz(checkpoint, ("checkpoint",))
-        try:
-            same_settings(header["settings"], settings, checkpoint)
-            distiller.load(arrays)
-            if distiller.t:
-                curve, before = header["curve"], float(header["seconds"])
-                np.array(curve, float).reshape(-1, len(CURVE))[-1]  # raises where it is none
-                write_curve(out / "curve.csv", CURVE, curve)  # a kill may have come before it
-        except (LookupError, TypeError, ValueError, OverflowError) as error:
-            raise UserError(f"{checkpoint}: damaged ({error!r}); delete it to start anew") from None
+        same_settings(header["settings"], settings, checkpoint)
+        distiller.load(arrays)
+        if distiller.t:
+            curve, before = header["curve"], header["seconds"]
+            write_curve(out / "curve.csv", CURVE, curve)  # a kill may have come before it
     elif not (out / "student.npz").exists():
         need_none(out, "config.json", "result.json", "curve.csv", "curve.png")
     began, saved = time.monotonic(), -np.inf
@@ -2238,13 +2162,11 @@ def draw_curve(path, curve, title):
             from matplotlib import figure, rcParams
         rcParams["text.usetex"] = False
         picture = figure.Figure(figsize=(10, 3.6), layout="constrained")
-        for ax, keys, label in zip(picture.subplots(1, 2), (CURVE[3:5], CURVE[6:]), (
-                "KL divergence", "rank correlation, held-out states")):
-            for key, line in zip(keys, ("-", "--", "-.")):
-                ax.plot(columns["step"], columns[key], line, label=key.replace("_", " "))
-            ax.set(xlabel="gradient step", ylabel=label, title=title)
-            ax.legend()
-        picture.axes[0].set_yscale("log")
+        for ax, keys, label, scale in zip(picture.subplots(1, 2), (CURVE[3:5], CURVE[6:]), (
+                "KL divergence", "rank correlation, held-out states"), ("log", "linear")):
+            lines = ax.plot(columns["step"], np.transpose([columns[key] for key in keys]))
+            ax.legend(lines, keys)
+            ax.set(xlabel="gradient step", ylabel=label, title=title, yscale=scale)
         with atomic_file(path) as file:
             picture.savefig(file, dpi=110, format="png")
     except Exception as error:
@@ -2260,7 +2182,7 @@ def read_records(path):
         records = json.loads(path.read_text(encoding="utf-8")) if os.path.exists(path) else {}
         return {key: ([float(r) for r in about["returns"]], dict(about["versions"]))
                 for key, about in records.items()}
-    except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+    except Exception as error:  # a user's own file can raise nearly anything
         raise UserError(f"{path}: not what evaluate --record writes ({error}); rename it") from None
 
 
@@ -2299,29 +2221,36 @@ def command_distill(args):
     """distill: expert and replay in, student, learning curve, table and JSON out."""
     began = time.monotonic()
     named = "plain" if args.plain and args.preset == "default" else args.preset
-    preset = functools.partial(preset_values, preset=named)
     config = from_args(DistillConfig, args, **{
-        **preset(DistillConfig), **({"reuse": 1} if args.plain else {})})
+        **preset_values(DistillConfig, named), **({"reuse": 1} if args.plain else {})})
     expert, header, replay, path = load_data(args)
-    theirs = {**preset(PlannerConfig), **made_for(header, path)}
+    theirs = {**preset_values(PlannerConfig, named), **made_for(header, path)}
     own = PlannerConfig(**theirs)  # the expert's
     search = student_planning(config) if getattr(args, "PlannerConfig.prior") != "last" else {}
     planning = from_args(PlannerConfig, args, **{
         **theirs, **(search and {"elites": 0, "min_std": PlannerConfig.min_std}), **search,
         "horizon": config.horizon, **({"speed": "plain"} if args.plain else {})})
-    distiller_class = PlainDistiller if args.plain else Distiller
     out = Path(args.out or f"runs/{args.task}-{args.seed}")
     read_records(path)  # what is damaged is missed now
-    with contextlib.closing(distiller_class(expert, replay, config, args.num_agents,
-                                            args.seed)) as distiller, locked(out):
-        for planned in ((expert, own), (distiller.student, planning)):
-            Planner(*planned)  # what is missing, or too large, is missed now
+    with contextlib.closing((PlainDistiller if args.plain else Distiller)(
+            expert, replay, config, args.num_agents, args.seed)) as distiller, locked(out):
         result, planning = distil_and_save(distiller, args, planning, header, out)
         obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
-        result.update(compare((expert, own), (distiller.student, planning), obs, path, args))
+        found, rows = compare(compared((expert, own), (distiller.student, planning)), obs, path,
+                              args)
+        result.update(found)
         result.update(seconds_total=round(result["seconds_total"] + time.monotonic() - began, 1))
         write_json(out / "result.json", result)
-    report(result, (own, planning))
+    print("\n{task}, N = {num_agents}, {episodes} episodes, evaluation seed {eval_seed}, horizon "
+          "{expert_horizon} and {student_horizon}\n".format_map(result))
+    print_table(rows)
+    if played := len(result["played"] and result["played"][0]["returns"]):
+        print(f"\nthe student's search was chosen by playing {played} episodes of the run's own "
+              "seeds; first deviation {max_std}".format_map(result))
+    kept = "-" if result["kept"] is None else f"{result['kept']:.2f}"
+    print(f"\nreturn kept {kept}, rank correlation of the return "
+          f"{result['rank_correlation_returns'][-1]:.3f}; Algorithm 1 distilled in "
+          "{seconds:.0f} s, {seconds_total:.0f} s in all, {out}/".format_map(result))
     return result
 
 
@@ -2344,41 +2273,35 @@ def load_data(args):
 
 def distil_and_save(distiller, args, planning, header, out):
     """Algorithm 1 to its end, then the priors and the choice of a search where no flag says
-    otherwise; writes student, curve and configuration. Returns result's part, and the student's
-    planning."""
-    student, config, replay = distiller.student, distiller.config, distiller.replay
-    sizes, finished, played = student.config, {}, []
-
-    def planned(**search):
-        few = {name: max(search[name], planning.elites) for name in {"samples"} & {*search}}
-        return from_args(PlannerConfig, args, **{**vars(planning), **search, **few})
-
+    otherwise; writes student, curve and configuration. A finished run's student stays as its file
+    has it. Returns result's part, and the student's planning."""
+    student, config, played = distiller.student, distiller.config, []
+    plannings = [*dict.fromkeys(from_args(PlannerConfig, args, **{**vars(planning), **search})
+                                for search in SEARCHES if planning.prior == "own")]
     settings = {"task": args.task, "seed": args.seed,
-                "num_agents": sizes.groups or sizes.num_agents,
-                "distill": vars(config), "data": data_checksums(distiller.expert, replay),
-                "action_repeat": planning.action_repeat}
-    if (path := out / "student.npz").exists():  # a run that this one would replace
-        model, finished = load_model(path, ["student"])
-        same_settings({key: finished.get(key) for key in settings}, settings, path)
+                "num_agents": student.config.groups or student.config.num_agents,
+                "distill": vars(config), "action_repeat": planning.action_repeat,
+                "data": data_checksums(distiller.expert, distiller.replay)}
+    if finished := (path := out / "student.npz").exists():
+        model, about = load_model(path, ["student"])
+        same_settings({key: about.get(key) for key in settings}, settings, path)
         student.params.update(prior_weights(model))
+        planning = planning_of(about, path, args, speed=planning.speed)
+        played = about.get("played", [])
     need(finished or not config.priors or planning.prior == "own", "--plan-prior last: expected "
          "--no-priors, or a run whose search is chosen: give the command without it first")
+    Planner(student, planning)  # what it lacks is missed now
     print(f"{args.task}: {student.config.num_agents} agents, {len(distiller.optimizer.vector):,} "
-          f"weights; replay of {replay.transitions:,} transitions; {config.steps:,} steps of "
-          f"{config.batch_size} x {config.noise_samples}; results in {out}", file=sys.stderr)
+          f"weights; {config.steps:,} steps of {config.batch_size} x {config.noise_samples}; "
+          f"results in {out}", file=sys.stderr)
     curve, seconds, before = train_student(distiller, out, settings, planning, args.workers)
     q, g = (ranks.tolist() for ranks in distiller.ranks(256, planning.discount))
-    if finished:  # whose file stays as it is, whatever flags say of today's planning
-        own, played = made_for(finished, path), finished.get("played", [])
-        if planning.prior == own.get("prior") == "own":
-            planning = planned(**{name: own[name] for name in CHOSEN if name in own})
-    elif config.priors:
-        taught = teach_priors(distiller, args.task, planning, args.workers)
-        if planning.prior == "own" and config.expert_episodes:
-            planning, played = choose_by_playing(
-                distiller, args.task, taught, [*dict.fromkeys(
-                    planned(**search) for search in SEARCHES)], args.workers)
     if not finished:
+        if config.priors:
+            taught = teach_priors(distiller, args.task, planning, args.workers)
+            if config.expert_episodes:
+                planning, played = choose_by_playing(distiller, args.task, taught, plannings,
+                                                     args.workers)
         save_model(path, student, {
             "kind": "student", **settings, "training": header.get("training", {}),
             "planner": {name: getattr(planning, name) for name in SEARCH}, "played": played})
@@ -2392,86 +2315,55 @@ def distil_and_save(distiller, args, planning, header, out):
             }, planning
 
 
-COMPARED = {"expert": "the expert", "student": "the student", "policy": "its policy alone",
-            "reflex": "its priors alone"}
+def planning_of(header, where, args, **more):
+    """How a model's file says that it plans, under flags; what it says of a search around priors
+    is left out with --prior last."""
+    own = made_for(header, where)
+    if getattr(args, "PlannerConfig.prior") == "last" and own.get("prior") == "own":
+        own = {name: value for name, value in own.items() if name not in SEARCH}
+    return from_args(PlannerConfig, args, **own, **more)
+
+
+COMPARED = {"expert": "the expert", "policy": "its policy alone",
+            "reflex": "the student's priors alone", "student": "the student"}
 
 
 def compared(expert, student):
     """What distill compares, (model, planning) by COMPARED's keys: these two; the expert's policy
     alone; and, if the student searches, its priors alone."""
     (model, own), (learner, planning) = expert, student
-    found = {"expert": expert, "student": student}
+    found = {"expert": expert}
     if model.has_policy:
         found["policy"] = model, dataclasses.replace(own, prior="own", iterations=0)
     if planning.prior == "own" and planning.iterations:
         found["reflex"] = learner, dataclasses.replace(planning, iterations=0)
-    return found
+    return {**found, "student": student}
 
 
-def compare(expert, student, obs, path, args):
+def compare(each, obs, path, args):
     """Of all that is `compared` the returns, from the record beside the expert's file `path` or
-    measured, and the milliseconds of a decision in this process: result's part."""
+    measured, and the milliseconds of a decision in this process: result's part, a table's rows."""
     found = {"episodes": args.episodes, "eval_seed": args.eval_seed}
-    for name, (model, planning) in (each := compared(expert, student)).items():
+    calls = [functools.partial(Planner(*planned).act, obs) for planned in each.values()]
+    timed = 1e3 * np.median(interleaved_seconds(calls, 20, "timing"), 0)
+    rows = [("", "MPPI", "return", "ms a decision", "speed-up")]
+    for (name, (model, planning)), ms in zip(each.items(), timed.tolist()):
         returns, versions = recorded_returns(path, model, args.task, planning, args.eval_seed)
+        source = " (recorded)" if versions == software() else " (recorded with other versions)"
         recorded = len(returns) >= args.episodes and not args.evaluate_expert
         if not recorded:
-            versions, returns = software(), evaluate(
+            source, versions, returns = "", software(), evaluate(
                 model, args.task, planning, args.episodes, args.eval_seed, args.workers,
                 f"evaluating {COMPARED[name]}")["returns"]
-        returns = returns[:args.episodes]
-        about = {"returns": returns, "return_mean": float(np.mean(returns)),
-                 "return_std": float(np.std(returns)), "horizon": planning.horizon,
-                 "recorded": recorded, "versions": versions}
+        mean, std = (float(of(returns[:args.episodes])) for of in (np.mean, np.std))
+        about = {"returns": returns[:args.episodes], "return_mean": mean, "return_std": std,
+                 "horizon": planning.horizon, "recorded": recorded, "versions": versions}
         found.update({f"{name}_{key}": value for key, value in about.items()})
-    calls = [functools.partial(Planner(*of).act, obs) for of in each.values()]
-    ms = 1e3 * np.median(interleaved_seconds(calls, 20, "timing"), 0)
-    found.update({f"plan_ms_{name}": float(value) for name, value in zip(each, ms)})
-    return {**found, "speedup": found["plan_ms_expert"] / found["plan_ms_student"],
-            "kept": return_kept(found["student_return_mean"], found["expert_return_mean"])}
-
-
-def report(result, plannings):
-    """Print distill's table. plannings: the expert's and the student's."""
-    source = "measured now" if not result["expert_recorded"] else "recorded" if (
-        result["expert_versions"] == software()) else "recorded with other versions"
-    own, search = (f"{of.samples} x {of.iterations}" if of.iterations else "0" for of in plannings)
-    print("\n{task}, {episodes} episodes, evaluation seed {eval_seed}, horizon {expert_horizon} "
-          "and {student_horizon}\n".format_map(result))
-    rows, student = [("", "MPPI", "return", "ms a decision", "speed-up")], (
-        f"student, N = {result['num_agents']}")
-    for who, name, budget in (("expert", f"expert ({source}), one process", own),
-                              ("policy", COMPARED["policy"], "0"),
-                              ("reflex", f"{student}, its priors alone", "0"),
-                              ("student", f"{student}, one process", search)):
-        if ms := result.get(f"plan_ms_{who}"):  # or it isn't `compared`
-            rows.append((name, budget, f"{result[f'{who}_return_mean']:.0f} ± "
-                         f"{result[f'{who}_return_std']:.0f}", f"{ms:.1f}",
-                         f"{result['plan_ms_expert'] / ms:.1f}"))
-    print_table(rows)
-    if result["played"]:
-        report_played(result)
-    kept = "-" if result["kept"] is None else f"{result['kept']:.2f}"
-    print(f"\nreturn kept {kept}, rank correlation of the return "
-          f"{result['rank_correlation_returns'][-1]:.3f}; Algorithm 1 distilled in "
-          "{seconds:.0f} s, {seconds_total:.0f} s in all, {out}/".format_map(result))
-
-
-def report_played(result):
-    """Print what `choose_by_playing` saw: returns, and by what each is below the best one."""
-    played = result["played"]
-    best = np.array(max((of["returns"] for of in played), key=np.mean))
-    search = "{samples} x {iterations}, deviation {max_std}" if result["iterations"] else "none"
-    print(f"\nchosen by playing {len(best)} episodes of the run's own seeds (below the best ± "
-          f"standard error): {search.format_map(result)}\n")
-    rows = [("priors taught", "MPPI", "first deviation", "return", "below the best")]
-    for of in played:
-        behind = best - np.array(of["returns"])
-        search = (f"{of['samples']} x {of['iterations']}", f"{of['max_std']}")
-        rows.append((of["taught"], *(search if of["iterations"] else ("0", "-")),
-                     f"{np.mean(of['returns']):.0f}",
-                     f"{behind.mean():.0f} ± {behind.std() / max(1, len(best) - 1) ** 0.5:.0f}"))
-    print_table(rows)
+        found[f"plan_ms_{name}"], found["speedup"] = ms, float(timed[0]) / ms
+        search = f"{planning.samples} x {planning.iterations}" if planning.iterations else "0"
+        rows.append((COMPARED[name] + source, search, f"{mean:.0f} ± {std:.0f}", f"{ms:.1f}",
+                     f"{found['speedup']:.1f}"))
+    return {**found, "kept": return_kept(mean, found["expert_return_mean"])}, rows
 
 
 def return_kept(student, expert):
@@ -2490,10 +2382,7 @@ def command_evaluate(args):
     """evaluate: a model's returns on a task."""
     model, header = load_model(args.model)
     task = args.task or header.get("task")
-    own = made_for({**header, "task": task}, args.model)
-    if getattr(args, "PlannerConfig.prior") == "last" and own.get("prior") == "own":
-        own = {name: value for name, value in own.items() if name not in SEARCH}  # around these
-    planning = from_args(PlannerConfig, args, **own)
+    planning = planning_of({**header, "task": task}, args.model, args)
     need(task, f"{args.model}: header: no task; pass --task")
     need(task == header.get("task") or not args.record, f"{args.model}: header: task: expected "
          f"{task!r} to record its returns, found {header.get('task')!r}")
@@ -2566,7 +2455,11 @@ def make_parser():
     parser = Parser(prog="fac_tdmpc_ref.py", description="Fac-TDMPC in NumPy: distil a TD-MPC "
                     "expert into one small world model for each joint, and plan with them.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    positive = functools.partial(natural, least=1)
+
+    def add_episodes(add):
+        add("--episodes", type=functools.partial(natural, least=1), default=20,
+            help="evaluation episodes [20]")
+        add("--workers", type=natural, help="processes that play episodes; 0: this one [cores]")
 
     sub = add_command(commands, "distill", command_distill, "Distil a task's expert into a "
                       "factored student (Algorithm 1), then evaluate and time both with MPPI.",
@@ -2579,19 +2472,17 @@ def make_parser():
     agents = sub.add_mutually_exclusive_group().add_argument
     agents("--num-agents", type=int, help="N, a divisor of dim(A) [dim(A)]")
     agents("--agents", dest="num_agents", help="action dimensions of each, equally many: 0,2/1,3")
-    add("--preset", choices=("default", "plain", "paper"), default="default", help="paper: the "
-        "paper's value of every setting that names one below (days on a laptop); plain: the "
-        "paper's method at this project's budget, without what it adds [D8] [D9]")
-    add("--plain", action="store_true", help="Part I of the module alone: the plain preset, or "
-        "the paper's, by the loop and the planner that it reads; slower, and not resumed")
-    add("--expert", help="expert file, or a folder with expert.npz and replay.npz "
-        "[data/experts/TASK]")
+    add("--preset", choices=("default", "plain", "paper"), default="default", help="paper: its "
+        "value of every setting that names one below (days); plain: the paper's method at this "
+        "project's budget, without what it adds [D8] [D9]")
+    add("--plain", action="store_true", help="Part I of the module alone, with the plain preset or "
+        "the paper's; slower, and not resumed")
+    add("--expert", help="expert file, or folder with expert.npz, replay.npz [data/experts/TASK]")
     add("--replay", help="replay file [replay.npz beside the expert]")
     add("--out", help="folder for the results [runs/TASK-SEED]")
     add("--eval-seed", type=natural, default=0, help="of the evaluation episodes [0]")
     add("--evaluate-expert", action="store_true", help="measure the expert, in spite of a record")
-    add("--episodes", type=positive, default=20, help="evaluation episodes [20]")
-    add("--workers", type=natural, help="processes that play episodes; 0: this one [cores]")
+    add_episodes(add)
     add_config(sub, DistillConfig)
     for flag, name in (("--own-episodes", "expert_episodes"), ("--own-share", "played_share")):
         add(flag, dest=f"DistillConfig.{name}", type=int, choices=[0],  # of earlier scripts
@@ -2606,8 +2497,7 @@ def make_parser():
     add("--task", help="one of: " + TASK_NAMES + " [the model's own]")
     add("--seed", type=natural, default=0, help="of the episodes [0]")
     add("--record", action="store_true", help="keep them in a .json beside the model, for distill")
-    add("--episodes", type=positive, default=20, help="[20]")
-    add("--workers", type=natural, help="processes that play episodes; 0: this one [cores]")
+    add_episodes(add)
     add_config(sub, PlannerConfig, "MPPI; a student's file has its own", skip=("action_repeat",))
     return parser
 
@@ -2635,10 +2525,7 @@ def run_command(parser, argv=None):
             error = f"{error.filename}: can't be read or written: {error.strerror}"
         elif isinstance(error, OSError):  # a full stdout's, which would fail again at the end
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        try:
-            print(f"{parser.prog}: error: {str(error) or 'not enough memory'}", file=sys.stderr)
-        except OSError:  # its reader is gone, as head's
-            os.dup2(1, 2)
+        print(f"{parser.prog}: error: {str(error) or 'not enough memory'}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"{parser.prog}: interrupted; the same command goes on from its last checkpoint, "

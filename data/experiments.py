@@ -5,29 +5,21 @@
     python data/experiments.py figure4 --tasks walker-run --seeds 0 1 2
     python data/experiments.py report
 
-Figures 4, 5, 7, 8, 12, 13, departures, `students` and `sweep` are lists of runs, each a task, a
-seed, a case and settings. Rows go to one CSV under data/results, which one command has at a time,
-as runs end; the same command again makes those that are missing. `report` draws all but sweeps,
-from CSVs and the experts' records. Table 3 is in speed.py, section 5.6 in look.py, what is
-distilled in other ways in baselines.py, statistics and drawing in tables.py.
+Figures 4, 5, 7, 8, 12, 13, departures, `students` and `sweep` are lists of runs (runs.py), whose
+rows go to one CSV each under data/results. `report` draws all but sweeps, from CSVs and the
+experts' records. Table 3 is in speed.py, section 5.6 in look.py, what is distilled in other ways
+in baselines.py, statistics and drawing in tables.py.
 """
 import contextlib
 import csv
-import ctypes
 import dataclasses
 import functools
-import importlib.util
-import io
 import itertools
 import json
-import multiprocessing
-import operator
 import os
 import re
 import sys
-import time
 from collections import Counter, defaultdict
-from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
 import numpy as np
@@ -39,173 +31,13 @@ import plots  # noqa: E402
 import speed  # noqa: E402
 import students  # noqa: E402
 from baselines import DecodingEnvironment, distiller_of  # noqa: E402
+from runs import (  # noqa: E402
+    ROW, append_rows, finished, key_of, lock, make_all, make_run, read_rows, unique, versions)
 from tables import (  # noqa: E402
     budget_cells, budgets_of, cell, draw_bars, draw_lines, halves, kept_cell, kept_difference, last,
     markdown, of_returns)
 
-# ------------------------------------------------------ runs, many at a time, each only once
-
 RESULTS = fac.DATA / "results"
-KEY = ("task", "seed", "case", "settings")  # what a run is; the rest is what it found
-key_of = operator.itemgetter(*KEY)  # what a run, or any of its rows, is known by
-NUMBERS = ("step", "return_mean", "return_std", "return_min", "expert_mean", "rank_q",
-           "rank_return", "ms", "ms_workers", "minutes", "evaluation_seed")
-LISTS = ("returns", "expert_returns", "policy_returns", "ranks")  # JSON; returns by episode
-ROW = (*KEY, *NUMBERS, *LISTS, "versions", "error")
-
-
-def make_run(task, seed, case, **settings):
-    """A run as its rows begin: settings, of which None means not set, as JSON. It is known by what
-    is set and, in `data`, by what it is made from."""
-    settings = {k: v for k, v in settings.items() if v is not None}
-    return {"task": task, "seed": str(seed), "case": case,
-            "settings": json.dumps(settings, sort_keys=True)}
-
-
-def unique(runs):
-    """Each run once, in their order: a task, a seed or a value may be named twice."""
-    return list({key_of(run): run for run in runs}.values())
-
-
-def read_rows(path):
-    """A CSV's rows, dicts of strings; without a line that a kill cut off."""
-    text = Path(path).read_text("utf-8", "replace") if Path(path).exists() else ""
-    head, *lines = text.splitlines() or [""]
-    columns = ",".join(ROW)  # of which a kill may have left a part
-    fac.need(head == columns or "\n" not in text and columns.startswith(head),
-             f"{path}: expected the columns {columns}, found {head[:200]!r}; choose another --out")
-    rows = []
-    for line in lines:
-        try:
-            row = dict(zip(ROW, cells := next(csv.reader([line]), [])))
-            if len(cells) == len(ROW):  # a kill cuts one line alone
-                numbers = [float(row[key] or 0) for key in NUMBERS]
-                fac.need(np.isfinite(numbers).all() and json.loads(row["settings"]).items, "")
-                fac.need(all(isinstance(json.loads(row[key]), dict if key == "ranks" else list)
-                             for key in LISTS if row[key]), "")
-                rows.append(row)
-        except (ValueError, TypeError, AttributeError, RecursionError, csv.Error, fac.UserError):
-            raise fac.UserError(f"{path}: expected numbers from {ROW[4]} on, settings and lists as "
-                                f"JSON, found {line[:200]}; delete the line") from None
-    return rows
-
-
-def append_rows(path, rows):
-    """Add a run's rows to a CSV in one write."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, ROW, lineterminator="\n")
-    try:
-        with open(path, "a+b") as file:
-            file.seek(0)
-            before = file.read()
-            if b"\n" not in before:
-                file.truncate(0)
-                writer.writeheader()
-            elif not before.endswith(b"\n"):
-                text.write("\n")  # ends a line that was cut off
-            writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else json.dumps(v) if
-                              k in LISTS else v for k, v in row.items()} for row in rows)
-            file.write(text.getvalue().encode())
-    except OSError as error:
-        raise fac.UserError(f"{path}: can't be written: {error.strerror}; the same command makes "
-                            "what is missing") from None
-
-
-def lock(path):
-    """`fac.locked` for a CSV, which is made."""
-    fac.check_writable(path)
-    path.touch()
-    return fac.locked(path, folder=False)
-
-
-def finished(rows):
-    """Rows of runs that came to their end, by run: {(task, seed, case, settings): rows}."""
-    runs = {}
-    for row in rows:
-        runs.setdefault(key_of(row), []).append(row)
-    return {key: found for key, found in runs.items() if any(row["minutes"] for row in found)}
-
-
-def attempt(function, run, home):
-    """A run's rows; one that fails is a row with its error. home: the process that waits."""
-    if home != os.getpid():
-        os.environ["TQDM_DISABLE"] = "1"  # a worker's own bars
-        multiprocessing.set_start_method("spawn", force=True)  # loky's can't start a run's workers
-        if os.getppid() == home and sys.platform == "linux":  # ends with it
-            ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG, SIGKILL
-    began = time.monotonic()
-    with fac.one_thread(), contextlib.redirect_stdout(sys.stderr):
-        try:
-            settings = json.loads(run["settings"])
-            fac.need(settings.get("data") == made_from(run["task"], settings),
-                     f"data/experts/{run['task']} or a default has changed; give the command again")
-            settings.pop("data", None)
-            found = list(function(run["task"], int(run["seed"]), run["case"], settings))
-            fac.need(all(np.isfinite(v) for row in found for v in row.values()
-                         if isinstance(v, float)), f"found {found[-1]}, not finite")
-            found[-1].setdefault("minutes", (time.monotonic() - began) / 60)
-        except Exception as error:
-            return failed(run, error)
-    return [{**run, **row, "versions": versions()} for row in found]
-
-
-def versions():
-    """`fac.software`, as a row holds it."""
-    found = fac.software()
-    return ", ".join(f"{name} {found[name]}" for name in ("numpy", "mujoco", "fac-tdmpc-ref"))
-
-
-def failed(run, error):
-    """The rows of a run that ended so."""
-    return [{**run, "error": f"{type(error).__name__}: {' '.join(str(error).split())}"}]
-
-
-def in_processes(function, runs, jobs):
-    """Rows of each run as it ends, in so many processes here. One that dies takes the others with
-    it: runs that were begun are made again, each alone, which shows the one at fault."""
-    import joblib
-    todo = {key_of(run): run for run in runs}
-    while todo:
-        begun, parallel = {}, joblib.Parallel(  # 1 would be this process; a kill leaves no queue
-            max(2, jobs), return_as="generator_unordered", batch_size=1, pre_dispatch=jobs)
-        try:
-            for rows in parallel(joblib.delayed(attempt)(function, begun.setdefault(*item),
-                                                         os.getpid()) for item in [*todo.items()]):
-                del todo[key_of(rows[0])]
-                yield rows
-        except BrokenExecutor as error:
-            suspects = [todo.pop(key) for key in [*begun] if key in todo]
-            fac.need(suspects, f"processes die before their runs begin: {error}")
-            for run in suspects:
-                yield from (in_processes(function, [run], jobs) if suspects[1:] else
-                            [failed(run, error)])
-
-
-def connect(address):
-    """A dask cluster's client; UserError if there is none, or it lacks what runs need."""
-    with fac.optional("dask", "cluster"):
-        from dask.distributed import Client
-    try:
-        client = Client(address, timeout=10)
-    except (OSError, ValueError, TypeError) as error:
-        raise fac.UserError(f"--scheduler {address}: {error}") from None
-    known = importlib.util.find_spec, "baselines"
-    fac.need(all([client.run_on_scheduler(*known), *client.run(*known).values()]),
-             f"--scheduler {address}: it or a worker lacks data/ on its PYTHONPATH")
-    return client
-
-
-def on_cluster(function, runs, client):
-    """Rows of each run as it ends on a dask cluster."""
-    from dask.distributed import as_completed
-    with client:
-        futures = {client.submit(attempt, function, run, os.getpid(), pure=False): run
-                   for run in runs}
-        for future in as_completed(futures):
-            fac.need(not future.cancelled(), "the connection to the scheduler is lost; the same "
-                     "command makes what is missing")
-            error = future.exception()
-            yield failed(futures[future], error) if error else future.result()
 
 
 def csv_path(args):
@@ -214,32 +46,14 @@ def csv_path(args):
 
 
 def run_all(args, function, runs):
-    """function(task, seed, case, settings), rows, of all runs that the CSV doesn't hold; result."""
-    with fac.optional("joblib", "experiments"):
-        import joblib  # noqa: F401
+    """`make_all` for a command, whose runs have to belong in one figure."""
     for task in args.tasks:
         fac.lookup_task(task)
-    path, errors = csv_path(args), []
-    runs, keys = unique(runs), [*finished(read_rows(path))]
+    path = csv_path(args)
+    keys = [key for key in finished(read_rows(path)) if key[0] in args.tasks]
     if args.command in REPORTS:
-        one_figure(path, [*(key for key in keys if key[0] in args.tasks), *map(key_of, runs)],
-                   VARIED.get(args.command, ()))
-    client = connect(args.scheduler) if getattr(args, "scheduler", None) else None
-    with lock(path):
-        done = finished(read_rows(path))  # by whoever had it before, too
-        todo = [run for run in runs if key_of(run) not in done]
-        ended = (on_cluster(function, todo, client) if client else
-                 in_processes(function, todo, min(args.jobs, len(todo))))
-        append_rows(path, [])  # its head: what can't be written is missed now
-        with fac.progress(args.command, len(runs), "run", len(runs) - len(todo)) as bar:
-            for rows in ended:
-                append_rows(path, rows)
-                errors += [row["error"] for row in rows if row.get("error")]
-                bar.update()
-    for error in errors:
-        print(f"failed: {error}", file=sys.stderr)
-    print(f"{path}: {len(runs)} runs, {len(todo)} of them now, {len(errors)} failed")
-    return {"out": str(path), "runs": len(runs), "now": len(todo), "failed": len(errors)}
+        one_figure(path, [*keys, *map(key_of, runs)], VARIED.get(args.command, ()))
+    return make_all(path, function, runs, args.jobs, getattr(args, "scheduler", None))
 
 
 def planning_for(header, about):
@@ -260,6 +74,7 @@ def distil(task, seed, case, settings):
     """Distil a student; a row at each evaluation. settings: of DistillConfig, and `num_agents`,
     `evaluations` on the way, of so many `episodes`, planned with `samples` and `iterations` around
     priors that know its plans: no search is chosen here."""
+    need_same_data(task, settings)
     own = {k: settings.pop(k, v) for k, v in (("num_agents", None), ("evaluations", 1),
                                               ("episodes", 10))}
     about = {k: settings.pop(k) for k in ("samples", "iterations") if k in settings}
@@ -329,6 +144,13 @@ def crc(*settings):
     return fac.zlib.crc32(repr(settings).encode())
 
 
+def need_same_data(task, settings):
+    """UserError unless the `data` of a run's settings, which are taken out, are today's."""
+    fac.need(settings.get("data") == made_from(task, settings),
+             f"data/experts/{task} or a default has changed; give the command again")
+    settings.pop("data", None)
+
+
 def made_from(task, settings):
     """What the `data` of a run's settings would be now; None if they name none."""
     if settings.get("data") is None:
@@ -373,11 +195,17 @@ def command_students(args):
     all milliseconds anew, nothing else running."""
     config = fac.DistillConfig(**fac.preset_values(fac.DistillConfig, args.preset))
     args.steps = args.steps or config.steps
-    result = run_all(args, functools.partial(students.distil_student, students=args.students),
+    result = run_all(args, functools.partial(distil_student, folder=args.students),
                      distil_runs(args, lambda task: [
                          (args.preset, {"num_agents": fac.lookup_task(task)[3]})]))
     time_students(Path(result["out"]), args.tasks)
     return result
+
+
+def distil_student(task, seed, case, settings, folder):
+    """`students.distil_student`, of the data that the run names."""
+    need_same_data(task, settings)
+    yield from students.distil_student(task, seed, case, settings, folder)
 
 
 def time_students(path, tasks):
@@ -573,6 +401,7 @@ def online(task, seed, decisions, episodes):
 
 def follow(task, seed, case, settings):
     """train_expert.py --student fac: rows of the student's and the expert's returns."""
+    need_same_data(task, settings)
     args, _ = online(task, seed, **settings)
     args.run(args)
     with open(Path(args.out) / "curve.csv", newline="", encoding="utf-8") as file:
@@ -924,7 +753,8 @@ def make_parser():
     sub.add_argument("--decisions", type=positive,
                      help="of training, a multiple of 2000 [30000; walker-walk: 48000]")
     add_runs("figure13", lambda args: distil_and_time(args, lambda task: [
-        (f"N = {n}", {"num_agents": n}) for n in fac.divisors(fac.lookup_task(task)[3])]),
+        (f"N = {n}", {"num_agents": n}) for n in range(1, fac.lookup_task(task)[3] + 1)
+        if fac.lookup_task(task)[3] % n == 0]),
              "Appendix C.2: the number of agents; returns, then milliseconds (keep the machine "
              "quiet for these).", walkers, **curve)
     for sub in map(commands.choices.get, ("figure4", "figure7", "figure13")):

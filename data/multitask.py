@@ -25,6 +25,7 @@ import import_expert  # noqa: E402
 import latents  # noqa: E402
 import look  # noqa: E402
 from multitask_model import MultitaskDistiller, load, save  # noqa: E402
+from runs import finished, key_of, make_run, read_rows  # noqa: E402
 from tdmpc2 import Checkpoint  # noqa: E402
 
 # ----------------------------------------------------------------------------------- distill
@@ -335,7 +336,7 @@ def figure10_runs(args, config, made):
     """A run for each task, seed and case. made: a number that tells students apart."""
     cases = [(seed, case + prior) for seed in args.seeds for case in CASES
              for prior in ("", AROUND)]
-    return [experiments.make_run(task, seed, case, made=made, steps=config.steps,
+    return [make_run(task, seed, case, made=made, steps=config.steps,
                                  horizon=config.horizon, episodes=args.episodes)
             for task in args.tasks for seed, case in (*cases, (0, TEACHER), (0, POLICY))]
 
@@ -346,7 +347,7 @@ def command_figure10(args):
     config = read_config(args)
     look.need_plots(args.picture)
     fac.check_writable(out := experiments.csv_path(args))
-    experiments.read_rows(out)  # what is wrong with it is missed before hours of work
+    read_rows(out)  # what is wrong with it is missed before hours of work
     for expert, _, path in (load_expert(task, args.data) for task in args.tasks):
         fac.need(expert.has_policy, f"{path}: has no policy for students to plan around; name "
                  "other --tasks")
@@ -360,8 +361,8 @@ def command_figure10(args):
     result = experiments.run_all(args, functools.partial(
         play_marks, folder=args.students, data=args.data), runs)
     fac.need(not result["failed"], f"{result['out']}: {result['failed']} runs failed")
-    done = experiments.finished(experiments.read_rows(result["out"]))
-    rows = {key: done[key] for key in map(experiments.key_of, runs)}
+    done = finished(read_rows(result["out"]))
+    rows = {key: done[key] for key in map(key_of, runs)}
     found, ranks = over_tasks(rows, args.tasks), over_tasks(rows, args.tasks, "rank_return")
     experiments.draw_lines(args.picture, {
         title: ({case: cases[case] for case in cases if case != TEACHER},  # which is the level

@@ -71,8 +71,8 @@ class Episode:
         self.environment, self.seed, self.player = environment, seed, player
         self.exploration_std, self.rng = exploration_std, fac.stream(seed, "exploration")
         self.hold = hold
-        self.observation = [fac.checked(fac.ask(environment.reset, seed, "reset"),
-                                        (environment.dim_obs,), "reset: observation")]
+        self.observation = [fac.checked(environment.reset(seed), (environment.dim_obs,),
+                                        "reset: observation")]
         self.action, self.reward, self.over, self.terminated = [], [], False, False
         self._warm_start = None
 

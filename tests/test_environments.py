@@ -263,12 +263,11 @@ def test_a_robot_that_begins_the_next_episode_by_itself_ends_the_one_before():
 
 
 @pytest.mark.parametrize("answer, parts", [
-    (lambda t: (np.nan if t == 9 else 1.0,), ["decision 8:", "finite reward", "nan"]),
-    (lambda t: (None,), ["decision 0:", "finite reward"]),
-    (lambda t: (np.ones(2),), ["decision 0:", "finite reward"]),
-    (lambda t: ("good",), ["decision 0:", "finite reward", "'good'"]),
-    (lambda t: ({"r": 1},), ["decision 0:", "finite reward", "{'r': 1}"]),
-    (lambda t: (), ["decision 0:", "(observation, reward)", "found (array("]),
+    (lambda t: (np.nan if t == 9 else 1.0,), ["decision 8: reward", "not finite"]),
+    (lambda t: (None,), ["decision 0: reward", "not finite"]),
+    (lambda t: (np.ones(2),), ["decision 0: reward", "found (2,)"]),
+    (lambda t: ("good",), ["decision 0: reward", "good"]),
+    (lambda t: ({"r": 1},), ["decision 0: reward", "{'r': 1}"]),
     (lambda t: (1.0, False, False, {}), ["decision 0:", "(observation, reward)"]),
     (lambda t: (1.0, False, {"an older Gym's": 1}), ["decision 0:", "True or False", "older Gym"]),
     (lambda t: (1.0, np.nan), ["decision 0:", "True or False", "nan"])])
@@ -283,20 +282,8 @@ def test_what_ends_an_episode_may_be_of_any_type_that_is_true_or_false(end):
     assert play_robot(Robot(lambda t: (1.0, end)))[2].sum(1).tolist() == [1, 1]
 
 
-@pytest.mark.parametrize("steps", [0, -1, 200.0, "200"])
-def test_an_episode_of_no_number_of_decisions_is_refused(steps):
+def test_what_answers_nothing_of_use_is_refused_at_reset():
     robot = Robot()
-    robot.episode_steps = steps
-    with pytest.raises(fac.UserError, match="episode_steps: expected a whole number above 0"):
-        play_robot(robot)
-
-
-def test_what_answers_nothing_of_use_is_refused_at_reset_too():
-    robot = Robot()
-    for step in (None, 1.0):
-        robot.step = lambda action, step=step: step
-        with pytest.raises(fac.UserError, match="decision 0: expected .observation, reward"):
-            play_robot(robot)
     for first, part in ((np.full(3, np.nan), "not finite"), ((np.zeros(3), {}), "(array(["),
                         (np.full(3, 1e300), "not finite")):
         robot.reset = lambda seed, first=first: first
@@ -438,11 +425,11 @@ def test_mujoco_is_imported_when_an_environment_is_made_and_not_before():
 
 def test_a_mujoco_of_another_version_is_explained(monkeypatch):
     """It imports; its first model shows that it lacks a field."""
-    sizes = fac.import_dm_control()[2].Physics.from_xml_string.__globals__[
+    sizes = fac.import_dm_control().reacher.Physics.from_xml_string.__globals__[
         "wrapper"].mjbindings.sizes.array_sizes["mjmodel"]
     monkeypatch.setitem(sizes, "of_another_version", ("nv",))
     for make in (lambda: fac.Environment("reacher-hard"), lambda: fac.Environment("walker-walk"),
-                 lambda: fac.robot_sizes.__wrapped__("cartpole-swingup")):
+                 lambda: fac.lookup_task.__wrapped__("cartpole-swingup")):
         with pytest.raises(fac.UserError, match="of_another_version.*mujoco==3.17.0 beside dm-con"):
             make()
 

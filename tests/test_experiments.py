@@ -19,6 +19,7 @@ import experiments
 import fac_tdmpc_ref as fac
 import look
 import plots
+import runs
 import speed
 import students
 import tables
@@ -150,7 +151,6 @@ def rows_of(path):
 
 
 def test_a_killed_sweep_goes_on_and_makes_no_run_twice(tmp_path):
-    pytest.importorskip("joblib")
     flags = [*SWEEP, *SET, "lr=1e-3,2e-3,3e-3,4e-3", "--jobs", "2"]
     process = subprocess.Popen([sys.executable, ROOT / "data" / "experiments.py", *flags],
                                cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -174,7 +174,6 @@ def test_a_killed_sweep_goes_on_and_makes_no_run_twice(tmp_path):
 
 
 def test_a_failed_run_is_a_row_and_is_tried_again(tmp_path):
-    pytest.importorskip("joblib")
     flags = [*SWEEP, *SET, "noise-samples=3,1000000000"]
     for _ in range(2):
         done = run(*flags, "--json", cwd=tmp_path)
@@ -185,49 +184,46 @@ def test_a_failed_run_is_a_row_and_is_tried_again(tmp_path):
     assert len(rows) == 3 and len(rows_of(tmp_path / "sweep.csv")) == 1
 
 
-def seven_but_one_dies():
-    """A function of runs whose second seed ends its process, and four seeds' runs."""
-    def function(task, seed, case, settings):
-        if seed == 1:
-            os.kill(os.getpid(), 9)
-        print("a table")
-        yield {"return_mean": 7.0}
+def seven_but_one_dies(task, seed, case, settings):
+    """A run whose second seed ends its process."""
+    if seed == 1:
+        os.kill(os.getpid(), 9)
+    print("a table")
+    yield {"return_mean": 7.0}
 
-    return function, [experiments.make_run("cheetah-run", seed, "x") for seed in range(4)]
+
+SEVENS = [runs.make_run("cheetah-run", seed, "x") for seed in range(4)]
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_run_whose_process_dies_is_a_row_and_stops_nothing(jobs, capfd):
-    pytest.importorskip("joblib")
-    found = list(experiments.in_processes(*seven_but_one_dies(), jobs))
+    found = list(runs.in_processes(seven_but_one_dies, SEVENS, jobs))
     rows = {row["seed"]: row for (row,) in found}
-    assert len(found) == len(rows) == 4 and "SIGKILL" in rows["1"]["error"]
+    assert len(found) == len(rows) == 4 and "terminated abruptly" in rows["1"]["error"]
     assert all(rows[seed]["return_mean"] == 7 and rows[seed]["minutes"] >= 0 for seed in "023")
     assert capfd.readouterr().out == ""  # the last line is the command's own
 
 
+def with_a_worker(task, seed, case, settings):
+    expert, _ = fac.load_model(fac.data_file(task, "expert.npz"))
+    sizes = fac.student_config(expert.config, 2, "latent")
+    student = fac.new_student(expert, sizes, 0)[1]
+    with fac.Planner(student, fac.PlannerConfig(samples=4, iterations=1), workers=1) as planner:
+        yield {"return_mean": float(np.abs(planner.act(np.zeros(17))).max())}
+
+
 def test_a_run_may_have_workers_of_its_own():
-    pytest.importorskip("joblib")
-
-    def function(task, seed, case, settings):
-        expert, _ = fac.load_model(fac.data_file(task, "expert.npz"))
-        sizes = fac.student_config(expert.config, 2, "latent")
-        student = fac.new_student(expert, sizes, 0)[1]
-        with fac.Planner(student, fac.PlannerConfig(samples=4, iterations=1), workers=1) as planner:
-            yield {"return_mean": float(np.abs(planner.act(np.zeros(17))).max())}
-
-    ((row,),) = experiments.in_processes(function, [experiments.make_run("cheetah-run", 0, "x")], 1)
+    ((row,),) = runs.in_processes(with_a_worker, SEVENS[:1], 1)
     assert 0 < row["return_mean"] <= 1
 
 
 def test_a_run_without_a_finite_return_has_failed():
     run = experiments.make_run("cheetah-run", 0, "x")
-    (row,) = experiments.attempt(lambda *_: [{"return_mean": float("nan")}], run, os.getpid())
+    (row,) = runs.attempt(lambda *_: [{"return_mean": float("nan")}], run)
     assert "not finite" in row["error"] and "minutes" not in row
 
 
 def test_a_run_that_does_not_fit_its_figure_is_refused_before_the_work(tmp_path):
-    pytest.importorskip("joblib")
     write_rows(tmp_path / "4.csv", [("walker-run", 0, "TAP", {"steps": 3}, [{"minutes": 1.0}])])
     before = (tmp_path / "4.csv").read_bytes()
     refused(here("figure4", "--tasks", "walker-run", "--out", "4.csv", cwd=tmp_path), "4.csv: TAP",
@@ -263,18 +259,17 @@ def test_a_csv_is_one_command_s_until_it_ends(tmp_path):
 
 
 def test_workers_end_with_the_process_that_waits_for_them(tmp_path):
-    pytest.importorskip("joblib")
     flags = [*SWEEP[:-1], "orphan.csv", *SET, "lr=1e-3,2e-3", "--jobs", "2",
              "--steps", "100000"]
     process = subprocess.Popen([sys.executable, ROOT / "data" / "experiments.py", *flags],
                                cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     def workers():
-        """Processes in this folder that have the loky workers' command line and are at a run."""
+        """Processes in this folder that have a worker's command line and are at a run."""
         found = []
         for path in Path("/proc").glob("[0-9]*/cwd"):
             with contextlib.suppress(OSError):
-                if path.resolve() == tmp_path.resolve() and b"loky" in (
+                if path.resolve() == tmp_path.resolve() and b"spawn_main" in (
                         path.parent / "cmdline").read_bytes():
                     found.append(path.parent)
         return found
@@ -297,7 +292,6 @@ def test_workers_end_with_the_process_that_waits_for_them(tmp_path):
 
 def test_dask_gives_the_rows_that_processes_give(tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed")
-    pytest.importorskip("joblib")
     flags = [*SWEEP, *SET, "num-agents=3,6"]
     last_json(run(*flags, "--json", cwd=tmp_path))
     here = rows_of(tmp_path / "sweep.csv")
@@ -308,8 +302,7 @@ def test_dask_gives_the_rows_that_processes_give(tmp_path, monkeypatch):
         last_json(run(*flags, "--out", "dask.csv", "--scheduler", address, "--json",
                       cwd=tmp_path))
         cluster.scheduler.allowed_failures = 0
-        function, runs = seven_but_one_dies()
-        ((row,),) = experiments.on_cluster(function, runs[1:2], experiments.connect(address))
+        ((row,),) = runs.on_cluster(seven_but_one_dies, SEVENS[1:2], runs.connect(address))
     assert row["seed"] == "1" and row["error"].startswith("KilledWorker")
     assert rows_of(tmp_path / "dask.csv") == here and len(here) == 2
 
@@ -331,9 +324,9 @@ def test_dask_gives_the_rows_that_processes_give(tmp_path, monkeypatch):
     (["figure7", "--tasks", "walker-run", "--seeds", "7"], ["walker-run-7", "distill"]),
     (["report", "--results", "."], ["no runs"])])
 def test_bad_runs_are_refused(tmp_path, flags, parts):
-    pytest.importorskip("joblib")
     pytest.importorskip("matplotlib")
-    pytest.importorskip("distributed" if flags[-1] in ("nowhere", "tls://host:1") else "joblib")
+    if flags[-1] in ("nowhere", "tls://host:1"):
+        pytest.importorskip("distributed")
     before = sorted(experiments.RESULTS.iterdir())
     refused(here(*flags, cwd=tmp_path), *parts)
     assert sorted(experiments.RESULTS.iterdir()) == before  # the default --out
@@ -518,7 +511,7 @@ def test_a_figure12_run_counts_as_finished_by_its_last_row_alone(tmp_path, monke
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(train_expert, "train", train)
     run = experiments.make_run("walker-walk", 0, "online", decisions=6000, episodes=1)
-    rows = experiments.attempt(experiments.follow, run, os.getpid())
+    rows = runs.attempt(experiments.follow, run)
     assert [(row["step"], row["return_mean"], row["expert_mean"]) for row in rows] == [
         ("2000", 4.0, 5.0), ("6000", 6.0, 7.0)]
     assert rows[-1]["minutes"] == 3 / 60  # of all its stretches
@@ -706,12 +699,11 @@ def test_milliseconds_are_medians_over_rounds(monkeypatch):
 
 
 def test_figures_7_and_8_plan_with_both_models(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("joblib")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(experiments, "BUDGETS", [(8, 1), (4, 1)])
     fac.save_model("runs/reacher-hard-0/student.npz", random_model(), {"kind": "student"})
     flags = ["--tasks", "reacher-hard", "--seeds", "0", "--jobs", "1", "--episodes", "1",
-             "--students", str(tmp_path / "runs")]  # joblib's processes may be older than chdir
+             "--students", str(tmp_path / "runs")]
     for _ in range(2):  # nothing is missing the second time
         assert experiments.main(["figure7", *flags, "--rounds", "2", "--out", "7.csv"]) == 0
         rows = experiments.read_rows("7.csv")
@@ -721,9 +713,8 @@ def test_figures_7_and_8_plan_with_both_models(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: seen.extend(runs))
     assert experiments.main(["figure8", *flags]) == 0
     assert len(seen) == 2 * (1 + 3 * 3)
-    row = experiments.attempt(functools.partial(experiments.plan_with, students="runs"), {
-        **seen[-1], "settings": seen[-1]["settings"].replace("weights ", "weights 1")},
-        os.getpid())[-1]
+    row = runs.attempt(functools.partial(experiments.plan_with, students="runs"), {
+        **seen[-1], "settings": seen[-1]["settings"].replace("weights ", "weights 1")})[-1]
     assert row["error"] == ("UserError: student of reacher-hard, seed 0, in data/ or runs/, has "
                             "changed; give the command again")
     for data, status in ((experiments.data_checksums("reacher-hard"), 0), ([1, 2, None], 2)):
@@ -743,12 +734,12 @@ def test_a_run_made_with_other_defaults_is_another_run(monkeypatch):
         assert experiments.main(["sweep", *flags]) == 0
     assert seen[0] == seen[1] != seen[2]
     expected = "data/experts/reacher-hard or a default has changed; give the command again"
-    assert expected in experiments.attempt(experiments.distil, seen[0], os.getpid())[-1]["error"]
+    assert expected in runs.attempt(experiments.distil, seen[0])[-1]["error"]
     settings = {"decisions": 4000, "episodes": 1}
     before = experiments.made_from("walker-walk", {"data": 0, **settings})
     monkeypatch.setitem(train_expert.FOLLOWING_DEFAULTS, "played_share", 0.25)
     run = experiments.make_run("walker-walk", 0, "online", data=before, **settings)
-    row = experiments.attempt(experiments.follow, run, os.getpid())[-1]
+    row = runs.attempt(experiments.follow, run)[-1]
     assert "a default has changed" in row["error"]
 
 
@@ -881,11 +872,10 @@ def test_a_csv_without_a_row_is_begun_anew(tmp_path, left):
     (["figure4", "--cases", "10% TD-MPC", "Fac-TDMPC", "TAP"], ["10% TD-MPC", "Fac-TDMPC", "TAP"],
      ["10% TD-MPC", "Fac-TDMPC"])])
 def test_figures_4_and_13_distil_and_time_their_cases(tmp_path, monkeypatch, command, cases, timed):
-    pytest.importorskip("joblib")
     monkeypatch.chdir(tmp_path)
     short_episodes(monkeypatch)  # in this process
-    monkeypatch.setattr(experiments, "in_processes", lambda function, runs, jobs: (
-        experiments.attempt(function, run, os.getpid()) for run in runs))
+    monkeypatch.setattr(runs, "in_processes", lambda function, own, jobs: (
+        runs.attempt(function, run) for run in own))
     flags = ["--tasks", "reacher-easy", "--seeds", "0", "1", "--jobs", "1", "--steps", "1",
              "--episodes", "1", "--evaluations", "1", "--samples", "4", "--iterations", "1",
              "--rounds", "2"]
@@ -1175,8 +1165,8 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
     monkeypatch.setattr(students, "time_both", lambda *_: {
         "plan_workers": 0, **{f"plan_ms_{who}": 1.0 for who in (
             "expert", "policy", "same_search", "student_in_process", "student")}})
-    monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: (rows.extend(
-        row for run in runs for row in experiments.attempt(function, run, os.getpid())),
+    monkeypatch.setattr(experiments, "run_all", lambda args, function, own: (rows.extend(
+        row for run in own for row in runs.attempt(function, run)),
         {"out": tmp_path / "none.csv"})[1])
     for budget in ([], ["--iterations", "1", "--samples", "4"]):  # a copy of the student is there
         assert experiments.main([

@@ -57,20 +57,9 @@ def test_stdout(flags, unbuffered):
     assert done.stderr == "x: error: [Errno 28] No space left on device\n"
 
 
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
-@pytest.mark.parametrize("out", ["/dev/full", "/dev/null"])
-def test_stderr(out):
-    """Full, or read by a head that is gone: the exit status is the same, with or without a word."""
-    with open("/dev/full", "w") as full, open(out, "w") as stdout:
-        done = subprocess.run([sys.executable, ROOT / "fac_tdmpc_ref.py", "evaluate", "--model",
-                               "nowhere.npz"], stdout=stdout, stderr=full)
-    assert done.returncode == 2
-
-
 def test_distill(tmp_path, files, monkeypatch):
     command = distill_arguments(files)
-    monkeypatch.setattr(fac, "compare", lambda *_: {})
-    monkeypatch.setattr(fac, "report", lambda *_: None)
+    monkeypatch.setattr(fac, "compare", lambda *_: ({"kept": 1.0}, [("",)]))
     for size in (50, 1000):
         full_disk("checkpoint.npz", size, "fac_tdmpc_ref.py", *command, "--out", "a", cwd=tmp_path)
     for out in ("a", "b"):
@@ -83,7 +72,6 @@ def test_train_expert(tmp_path):
 
 
 def test_experiments(tmp_path):
-    pytest.importorskip("joblib")
     command = [*SWEEP, *SET]
     full_disk("sweep.csv", 20, "data/experiments.py", *command, cwd=tmp_path)
     assert experiments.read_rows(tmp_path / "sweep.csv") == []

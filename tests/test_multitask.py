@@ -14,11 +14,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import experiments
 import fac_tdmpc_ref as fac
 import latents
 import look
 import multitask
+import runs
 import toys
 from multitask_model import SCALES, TASKS, Multitask, MultitaskDistiller, load
 from toys import (ONE_THREAD, ROBOTS, ROOT, assert_close, last_json, launch, numeric_gradient,
@@ -291,12 +291,12 @@ def test_two_robots_end_to_end(data, student):
 @pytest.fixture
 def short_episodes(monkeypatch):
     """Of 10 decisions; an experiment's runs are made in this process."""
-    def in_this_process(function, runs, _):
-        for run in runs:
-            yield experiments.attempt(function, run, os.getpid())
+    def in_this_process(function, own, _):
+        for run in own:
+            yield runs.attempt(function, run)
 
     monkeypatch.setattr(fac, "CONTROL_STEPS", 20)
-    monkeypatch.setattr(experiments, "in_processes", in_this_process)
+    monkeypatch.setattr(runs, "in_processes", in_this_process)
 
 
 def test_evaluate(data, student, short_episodes):

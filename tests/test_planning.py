@@ -400,9 +400,9 @@ def test_an_observation_of_the_wrong_size_or_without_numbers_is_refused():
 def test_planner_config_refuses_nonsense():
     for wrong, text in (({"elites": 9, "samples": 8}, r"elites must be at most samples \(8\)"),
                         ({"min_std": 3.0}, r"min_std must be at most max_std \(2.0\)"),
-                        ({"discount": 1.1}, "at least 0 and at most 1"),
+                        ({"discount": 1.1}, "at most 1"),
                         ({"samples": 64.0}, "samples must be of type int, not 64.0"),
-                        ({"samples": 10 ** 8}, "at least 1 and at most 1000000"),
+                        ({"samples": 10 ** 8}, "at most 1000000"),
                         ({"discount": True}, "of type float"), ({"output": None}, "of type str"),
                         ({"inverse_temperature": 1e40}, "finite, as a float32")):
         with pytest.raises(fac.UserError, match=text):
@@ -505,16 +505,8 @@ def in_a_pool(workers):
 def test_a_pool_s_process_that_wants_workers_is_told_to_go_without():
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         for message in pool.apply(in_a_pool, [1]):
-            assert message.startswith("daemonic processes") and message.endswith("workers=0")
+            assert "daemonic processes" in message and "pass workers=0" in message
         assert pool.apply(in_a_pool, [0]) == [(3,), 1]
-
-
-def test_joblib_s_process_that_wants_workers_is_told_to_go_without():
-    joblib = pytest.importorskip("joblib")
-    joblib.externals.loky.get_reusable_executor().shutdown(kill_workers=True)  # of other tests
-    refused, played = joblib.Parallel(2)(joblib.delayed(in_a_pool)(n) for n in (1, 0))
-    assert all(message.endswith("pass workers=0") for message in refused)
-    assert played == [(3,), 1]
 
 
 @pytest.mark.parametrize("seed", [-1, 1.5, "x"])
@@ -549,7 +541,7 @@ def test_a_dead_worker_is_reported_and_nothing_hangs():
         processes = [process for process, _ in planner._workers._members]
         os.kill(processes[0].pid, signal.SIGKILL)
         began = time.monotonic()
-        for message in ("worker 0 ended with exit code -9", "worker 0 was stopped before"):
+        for message in ("worker 0 ended with exit code -9", "start anew"):
             with pytest.raises(fac.WorkerError, match=message):
                 for _ in range(3):
                     planner.act(np.zeros(8))

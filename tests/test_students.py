@@ -42,10 +42,10 @@ def test_students_are_compared_with_the_expert_in_their_search():
     expert = random_model(1, policy=True), own
     around = fac.PlannerConfig(**fac.STUDENT_PLANNING, elites=5, horizon=1)
     found = students.compared(expert, (None, around))
-    assert [*found] == ["expert", "student", "policy", "reflex", "same_search"]
+    assert [*found] == ["expert", "policy", "reflex", "student", "same_search"]
     model, same = found["same_search"]
     assert model is expert[0]  # its own horizon and discount; a student has no proposals
     assert same == fac.dataclasses.replace(around, horizon=2, discount=0.5, pi_trajs=0)
     alone = fac.dataclasses.replace(around, iterations=0)
-    assert [*students.compared(expert, (None, alone))] == ["expert", "student", "policy"]
-    assert [*students.compared(expert, (None, own))] == ["expert", "student", "policy"]
+    assert [*students.compared(expert, (None, alone))] == ["expert", "policy", "student"]
+    assert [*students.compared(expert, (None, own))] == ["expert", "policy", "student"]
