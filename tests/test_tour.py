@@ -9,7 +9,7 @@ import pytest
 import fac_tdmpc_ref as fac
 import tour
 from speed import multiply_adds
-from test_planning import random_model
+from toys import random_model
 
 STATES, PAGE = 32, fac.DATA / "tour.md"
 CONFIG = fac.dataclasses.replace(tour.CONFIG, steps=3, batch_size=8, noise_samples=4, warmup=1)
