@@ -1784,9 +1784,10 @@ class Replay:
         for key, rank, kinds in (("observation", 2, "float16, float32"), ("continues", 1, "bool"),
                                  ("action", 2, "float16, float32")):
             value = arrays.get(key, np.zeros(0, object))
+            found = f"{value.dtype} {value.shape}" if key in arrays else "nothing"
             need(value.ndim == rank and str(value.dtype) in kinds.split(", ")
                  and len(value) == len(arrays["observation"]), f"{path}: {key}: expected {kinds} "
-                 f"of rank {rank}, a row a transition, found {value.dtype} {value.shape}")
+                 f"of rank {rank}, a row a transition, found {found}")
             if rank == 2:
                 check_rows(f"{path}: {key}", value, 1 if key == "action" else None)
         self.observation, self.action = arrays["observation"], arrays["action"]

@@ -374,7 +374,7 @@ def test_settings_that_are_refused(values, parts):
 @pytest.mark.parametrize("key", ["observation", "action", "continues"])
 def test_replay_without_an_array(tmp_path, key):
     path = write_replay(tmp_path / "r.npz", **{key: None})
-    refusal(lambda: fac.Replay(path), path, key, "expected", "(0,)")
+    refusal(lambda: fac.Replay(path), path, key, "expected", "found nothing")
 
 
 @pytest.mark.parametrize("key, value", [
