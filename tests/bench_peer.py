@@ -307,16 +307,14 @@ def machine():
     return (names or [platform.processor()])[0], str(fac.cores()), ", ".join(sorted(kernels))
 
 
-def record(rows, path=ROOT / "data" / "results" / "bench.csv"):
-    """Keep (what, ratio) of this machine, in place of what the file has of it."""
-    kept = []
+def record(what, ratio, path=ROOT / "data" / "results" / "bench.csv"):
+    """Keep a ratio of this machine, in place of an earlier one."""
+    rows, key = [("processor", "cores", "blas", "what", "ratio")], (*machine(), what)
     if path.exists():
         with open(path, newline="", encoding="utf-8") as file:
-            kept = [row for row in list(csv.reader(file))[1:] if tuple(row[:3]) != machine()]
+            rows = [row for row in csv.reader(file) if tuple(row[:-1]) != key]
     with open(path, "w", newline="", encoding="utf-8") as file:
-        csv.writer(file, lineterminator="\n").writerows(
-            [("processor", "cores", "blas", "what", "ratio"), *kept,
-             *((*machine(), what, f"{ratio:.2f}") for what, ratio in rows)])
+        csv.writer(file, lineterminator="\n").writerows([*rows, (*key, f"{ratio:.2f}")])
 
 
 def main():
@@ -331,14 +329,14 @@ def main():
               "update_ratio": {}, "machine": machine(), "torch": torch.__version__,
               "numpy": np.__version__}
     print("{}, {} cores, BLAS {}".format(*machine()), flush=True)
-    rows = []  # (what, ratio)
 
     def show(what, found, threads=1, peer="PyTorch"):
         per = 20 if what.startswith("distillation") else 1
         many = f"{threads} thread{'s' * (threads > 1)}"
         print(f"{what:<42}{many:<10} NumPy {found[1] / per:7.1f} ms"
               f"  {peer} {found[2] / per:7.1f} ms  ratio {found[0]:.2f}", flush=True)
-        rows.append((f"{what}, {many}", found[0]))
+        if args.record and peer == "PyTorch" and "compile" not in what:
+            record(f"{what}, {many}", found[0])
         return found[0]
 
     result["central_ratio"] = show("plan, TD-MPC (N = 1, latent 512)", planning(1, 6, args.turns))
@@ -351,8 +349,6 @@ def main():
                 "distillation step", distillation(threads, args.turns), threads)
             result["update_ratio"][str(threads)] = show(
                 "update of TD-MPC (batch 256)", training(threads, args.turns), threads)
-    if args.record:
-        record(rows)
     os.sched_setaffinity(0, list(cores)[:1])  # JAX's own threads, too, begin on this one core
     for n in (1, 6, 21):
         found = planning(n, max(n, 6), args.turns, jax=True)
