@@ -236,13 +236,12 @@ def alone_tables(lines):
         ms = [np.mean([of[f"plan_ms_{who}"] for of in about])
               for who in ("expert", "student_in_process")]
         agents = json.loads(own[0]["settings"])["num_agents"]
-        short.append([f"{line}, N = {agents}", expert, policy, f"{student} ± {error:.0f}", search,
+        short.append([f"{line}, {agents}", expert, policy, f"{student} ± {error:.0f}",
                       f"{ms[0] / ms[1]:.0f}"])
         whole.append([line, agents, len(about), expert, policy, reflex, student, same,
                       f"{kept(own):.2f} ± {error / overall(own, 'expert_returns'):.2f}", search,
                       *(f"{x:.1f}" for x in ms)])
-    return (markdown(["task", "expert", "its policy alone", "student", "its search",
-                      "times as fast"], short),
+    return (markdown(["task, N", "expert", "its policy", "student", "times as fast"], short),
             markdown(["task", "N", "rows", "expert", "its policy alone", "priors alone", "student",
                       "expert, same search", "kept", "its search", "ms: expert",
                       "ms: student"], whole))
