@@ -116,7 +116,7 @@ class PlannerConfig(Settings):
 @dataclasses.dataclass(frozen=True)
 class Algorithm1Config(Settings):
     """Algorithm 1; paper: what `--preset paper` takes. Additions: Part II's `DistillConfig`."""
-    steps: int = field(3_500, "gradient steps (section 5.1: 10^5) [D1]", paper=100_000, least=1)
+    steps: int = field(7_000, "gradient steps (section 5.1: 10^5) [D1]", paper=100_000, least=1)
     batch_size: int = field(32, "B: states in a step [D1]", paper=512, least=2)
     noise_samples: int = field(5, "K: copies of actions, perturbed [D1]", paper=10, least=2)
     noise_std: float = field(0.3, "deviation of the noise [D9]", paper=0.5, plain=0.5, above=0)
@@ -2021,13 +2021,13 @@ def in_parts(function, obs):
 
 
 def learn_priors(distiller, data, number):
-    """A round of `prior_loss`: half as many steps as Algorithm 1's. data: pairs of x (1, F, M) and
+    """A round of `prior_loss`: a quarter of Algorithm 1's steps. data: pairs of x (1, F, M) and
     targets (N, L, d, M); half of a batch is from the first, half from the others, if any."""
     student, rng = distiller.student, stream(distiller.seed, "priors", number)
     x, targets = (np.concatenate(arrays, -1) for arrays in zip(*data))
     ends = np.unique([0, data[0][0].shape[-1], x.shape[-1]])
     config = dataclasses.replace(distiller.config, lr=PRIOR_LR,
-                                 steps=-(-distiller.config.steps // 2))
+                                 steps=-(-distiller.config.steps // 4))
     adam = prior_optimizer(student)
     with one_thread(), progress("teaching priors", config.steps, "step") as bar:
         for t in range(config.steps):

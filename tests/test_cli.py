@@ -44,7 +44,7 @@ def one_thread():
 @pytest.mark.parametrize("command, expected", [
     ((), ["distill", "evaluate"]),
     (("distill",), ["--task", "--preset", "--num-agents", "--evaluate-expert", "--plan-samples",
-                    "[3500; paper: 100000]", "[forward; paper: reverse]", "reacher-hard"]),
+                    "[7000; paper: 100000]", "[forward; paper: reverse]", "reacher-hard"]),
     (("evaluate",), ["--model", "--record", "--samples", "--output", "[4; paper: 6]"])])
 def test_help_is_quick_and_starts_nothing(tmp_path, command, expected):
     done = succeeded(launch(["-c", WATCHED, *command, "--help"], tmp_path))

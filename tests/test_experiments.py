@@ -1245,7 +1245,7 @@ def test_a_preset_s_students_have_its_budget_and_a_folder_of_their_own(monkeypat
         assert experiments.main(["students", "--tasks", "walker-run", "--seeds", "0", *flags]) == 0
     found = [(run["case"], *(json.loads(run["settings"]).get(k) for k in (
         "steps", "samples", "iterations"))) for run in seen]
-    assert found == [("default", 3500, None, None), ("paper", 100000, None, None),
+    assert found == [("default", 7000, None, None), ("paper", 100000, None, None),
                      ("paper", 14000, 128, 4)]
     assert [str(students.folder("runs", "walker-run", 0, preset)) for preset in (
         "default", "paper")] == ["runs/walker-run-0", "runs/walker-run-0-paper"]
