@@ -2293,8 +2293,10 @@ def distil_and_save(distiller, args, planning, header, out):
          "--no-priors, or a run whose search is chosen: give the command without it first")
     Planner(student, planning)  # what it lacks is missed now
     print(f"{args.task}: {student.config.num_agents} agents, {len(distiller.optimizer.vector):,} "
-          f"weights; {config.steps:,} steps of {config.batch_size} x {config.noise_samples}; "
-          f"results in {out}", file=sys.stderr)
+          f"weights; results in {out}\nto come: {config.expert_episodes} episodes of the expert's "
+          f"policy; {config.steps:,} steps of {config.batch_size} x {config.noise_samples}"
+          f"{f'; {PRIOR_ROUNDS + 1} rounds of priors; a search chosen' * config.priors}; "
+          f"{args.episodes} episodes to evaluate each", file=sys.stderr)
     curve, seconds, before = train_student(distiller, out, settings, planning, args.workers)
     q, g = (ranks.tolist() for ranks in distiller.ranks(256, planning.discount))
     if not finished:
