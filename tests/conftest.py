@@ -1,6 +1,7 @@
 import os
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small products; more threads only wait
+for library in ("OPENBLAS", "OMP"):  # products are small, t-SNE's threads spin: more only wait
+    os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
 import pytest  # noqa: E402
 

@@ -1423,30 +1423,29 @@ def test_figure9_and_agreement_draw_a_model(tmp_path, monkeypatch):
     pytest.importorskip("sklearn")
     pytest.importorskip("matplotlib")
     write_expert(tmp_path / "expert.npz")
-    student = random_model()
-    fac.save_model(tmp_path / "student.npz", student, {"kind": "student", "task": "reacher-hard"})
+    student, quick = random_model(), {"samples": 8, "iterations": 1}
+    fac.save_model(tmp_path / "student.npz", student, {"kind": "student", "task": "reacher-hard",
+                                                       "planner": quick})
     before = look.untrained(student, 3)  # as distillation begins
     fresh = fac.WorldModel.create(student.config, fac.stream(3, "student"))
     for key, value in before.params.items():
         own = fresh if key.startswith("_encoder.") else student
         assert np.array_equal(value, own.params[key]), key
-    monkeypatch.setattr(fac, "CONTROL_STEPS", 100)
-    monkeypatch.setattr(fac, "cores", lambda: 0)  # all episodes in this process
-    found = last_json(here("figure9", "--model", "student.npz", "--episodes", "2", "--points", "20",
-                           "--json", cwd=tmp_path))
+    found = last_json(run("figure9", "--model", "student.npz", "--episodes", "2", "--points", "20",
+                          "--json", cwd=tmp_path))  # the first to draw in its process
     assert found["silhouette"] is not None and set(found["moments"]) == {"best", "worst"}
     assert found["silhouette_untrained"] not in (None, found["silhouette"])
     assert (tmp_path / "figure9.png").read_bytes()[:4] == b"\x89PNG"
     sizes = fac.ModelConfig(*fac.lookup_task("finger-spin")[2:], 2, 4, 8, 8)  # none of the 11
     spin = fac.WorldModel.create(sizes, np.random.default_rng(0))
-    fac.save_model(tmp_path / "spin.npz", spin, {"kind": "student", "task": "finger-spin"})
-    monkeypatch.undo()  # a task of others' has its own length
-    found = last_json(here("figure9", "--model", "spin.npz", "--episodes", "1", "--points", "20",
-                           "--json", cwd=tmp_path))
+    fac.save_model(tmp_path / "spin.npz", spin, {"kind": "student", "task": "finger-spin",
+                                                 "planner": quick})
+    found = last_json(run("figure9", "--model", "spin.npz", "--episodes", "1", "--points", "20",
+                          "--json", cwd=tmp_path))
     assert found["task"] == "finger-spin"
     shutil.copy(fac.data_file("reacher-hard", "replay.npz"), tmp_path)  # beside the expert
     monkeypatch.setattr(fac, "CONTROL_STEPS", 100)
-    monkeypatch.setattr(fac, "cores", lambda: 0)
+    monkeypatch.setattr(fac, "cores", lambda: 0)  # all episodes in this process
     found = last_json(here("agreement", "--model", "student.npz", "--expert", ".",
                            "--episodes", "1", "--states", "8", "--json", cwd=tmp_path))
     assert len(found["held_out"]) == len(found["worst_episode"]) == 3

@@ -142,9 +142,9 @@ def replay_arrays(dims=(8, 3), episodes=6, rows=30, seed=1):
             "continues": np.arange(1, n + 1) % rows != 0}
 
 
-def write_replay(path, *about, task=None, **changes):
-    """`about`: the arguments of replay_arrays; `changes`: other arrays, or None for none."""
-    arrays = {**replay_arrays(*about), **changes}
+def write_replay(path, dims=(8, 3), episodes=6, rows=30, seed=1, task=None, **changes):
+    """`changes`: other arrays than replay_arrays', or None for none."""
+    arrays = {**replay_arrays(dims, episodes, rows, seed), **changes}
     fac.write_npz(path, {"kind": "replay", "task": task},
                   {k: v for k, v in arrays.items() if v is not None}, compress=True)
     return path
