@@ -59,7 +59,8 @@ def test_stdout(flags, unbuffered):
 
 def test_distill(tmp_path, files, monkeypatch):
     command = distill_arguments(files)
-    monkeypatch.setattr(fac, "compare", lambda *_: ({"kept": 1.0}, [("",)]))
+    told = dict.fromkeys(("episodes", "eval_seed", "expert_horizon", "student_horizon", "kept"), 1)
+    monkeypatch.setattr(fac, "compare", lambda *_: (told, [("",)]))
     for size in (50, 1000):
         full_disk("checkpoint.npz", size, "fac_tdmpc_ref.py", *command, "--out", "a", cwd=tmp_path)
     for out in ("a", "b"):
