@@ -1153,8 +1153,8 @@ class PlainDistiller(Distiller):
     def __init__(self, expert, replay, config, num_agents=None, seed=0):
         need((config.targets, config.policy_share, config.expert_episodes, config.reuse,
               config.priors, isinstance(num_agents, str)) == ("joint", 0, 0, 1, False, False),
-             "--plain goes without --targets, --policy-share, --expert-episodes, --reuse, --priors, "
-             "and with --num-agents for --agents")
+             "--plain goes without --targets, --policy-share, --expert-episodes, --reuse and "
+             "--priors, and with --num-agents for --agents")
         super().__init__(expert, replay, config, num_agents, seed)
         self._plain = distill(expert, replay, config, self.student.config.num_agents, seed)
 
