@@ -2022,17 +2022,15 @@ def in_parts(function, obs):
 
 def learn_priors(distiller, data, number):
     """A round of `prior_loss`: a quarter of Algorithm 1's steps. data: pairs of x (1, F, M) and
-    targets (N, L, d, M); half of a batch is from the first, half from the others, if any."""
+    targets (N, L, d, M)."""
     student, rng = distiller.student, stream(distiller.seed, "priors", number)
     x, targets = (np.concatenate(arrays, -1) for arrays in zip(*data))
-    ends = np.unique([0, data[0][0].shape[-1], x.shape[-1]])
     config = dataclasses.replace(distiller.config, lr=PRIOR_LR,
                                  steps=-(-distiller.config.steps // 4))
     adam = prior_optimizer(student)
     with one_thread(), progress("teaching priors", config.steps, "step") as bar:
         for t in range(config.steps):
-            chosen = np.concatenate([rng.integers(begin, end, PRIOR_BATCH // (len(ends) - 1))
-                                     for begin, end in zip(ends, ends[1:])])
+            chosen = rng.integers(x.shape[-1], size=PRIOR_BATCH)
             loss = prior_loss(student, x[..., chosen], targets[..., chosen], config.lam, adam.grads)
             adam.step(learning_rate(config, t), config.grad_clip)
             bar.update()

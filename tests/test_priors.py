@@ -244,22 +244,6 @@ def test_a_round_is_a_quarter_of_algorithm_1_s_steps_at_its_own_rate(replay, mon
     assert seen == [(fac.learning_rate(config, t), 2.0) for t in range(11)]
 
 
-@pytest.mark.parametrize("others", [[], [3], [50, 20]])
-def test_half_of_a_batch_is_from_the_states_that_priors_got_into_themselves(replay, monkeypatch,
-                                                                            others):
-    """Which the feature tells; all of these are drawn from alike."""
-    seen, loss = [], fac.prior_loss
-    monkeypatch.setattr(fac, "prior_loss", lambda student, x, *more: (
-        seen.append(x[0, 0]), loss(student, x, *more))[1])
-    with teachable(replay, steps=40, expert_episodes=0) as (distiller, _):
-        fac.learn_priors(distiller, [(np.full((1, 6, n), i, np.float32), np.zeros(
-            (3, 4, 1, n), np.float32)) for i, n in enumerate([200, *others])], 1)
-    counts = np.array([[(x == i).sum() for i in range(1 + len(others))] for x in seen])
-    assert len(counts) == 10 and (counts[:, 0] == 256 // (1 + bool(others))).all()
-    if len(others) == 2:
-        assert 2 < counts[:, 1].sum() / counts[:, 2].sum() < 3.3
-
-
 def test_priors_that_diverge_stop(replay):
     with teachable(replay, steps=40, expert_episodes=0) as (distiller, planning):
         distiller.student.params["_prior.0.weight"][:] = np.nan
