@@ -2243,9 +2243,13 @@ def command_distill(args):
     print("\n{task}, N = {num_agents}, {episodes} episodes, evaluation seed {eval_seed}, horizon "
           "{expert_horizon} and {student_horizon}\n".format_map(result))
     print_table(rows)
-    if played := len(result["played"] and result["played"][0]["returns"]):
-        print(f"\nthe student's search was chosen by playing {played} episodes of the run's own "
-              "seeds; first deviation {max_std}".format_map(result))
+    if played := result["played"]:
+        print(f"\nits search was chosen by playing {len(played[0]['returns'])} episodes of the "
+              "run's own seeds:\n")
+        print_table([("priors taught", "MPPI", "first deviation", "return"), *(
+            (of["taught"], *((f"{of['samples']} x {of['iterations']}", f"{of['max_std']}")
+                             if of["iterations"] else ("0", "-")), f"{np.mean(of['returns']):.0f}")
+            for of in played)])
     kept = "-" if result["kept"] is None else f"{result['kept']:.2f}"
     print(f"\nreturn kept {kept}, rank correlation of the return "
           f"{result['rank_correlation_returns'][-1]:.3f}; Algorithm 1 distilled in "
