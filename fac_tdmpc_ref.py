@@ -223,8 +223,7 @@ def norm_backward(dy, x, g):
     x_hat, scale = standardize(x)
     dg, dx = np.einsum("nfb,nfb->nf", dy, x_hat)[:, :, None], dy * g
     dx -= dx.mean(1, keepdims=True) + x_hat * (dx * x_hat).mean(1, keepdims=True)
-    dx *= scale
-    return dx, dg, dy.sum(2, keepdims=True)
+    return dx * scale, dg, dy.sum(2, keepdims=True)
 
 
 def forward(kinds, params, name, x, tape=None):

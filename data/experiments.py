@@ -53,7 +53,8 @@ def run_all(args, function, runs):
     keys = [key for key in finished(read_rows(path)) if key[0] in args.tasks]
     if args.command in REPORTS:
         one_figure(path, [*keys, *map(key_of, runs)], VARIED.get(args.command, ()))
-    return make_all(path, function, runs, args.jobs, getattr(args, "scheduler", None))
+    return make_all(path, functools.partial(of_same_data, function), runs, args.jobs,
+                    getattr(args, "scheduler", None))
 
 
 def planning_for(header, about):
@@ -74,7 +75,6 @@ def distil(task, seed, case, settings):
     """Distil a student; a row at each evaluation. settings: of DistillConfig, and `num_agents`,
     `evaluations` on the way, of so many `episodes`, planned with `samples` and `iterations` around
     priors that know its plans: no search is chosen here."""
-    need_same_data(task, settings)
     own = {k: settings.pop(k, v) for k, v in (("num_agents", None), ("evaluations", 1),
                                               ("episodes", 10))}
     about = {k: settings.pop(k) for k in ("samples", "iterations") if k in settings}
@@ -144,11 +144,13 @@ def crc(*settings):
     return fac.zlib.crc32(repr(settings).encode())
 
 
-def need_same_data(task, settings):
-    """UserError unless the `data` of a run's settings, which are taken out, are today's."""
+def of_same_data(function, task, seed, case, settings):
+    """A run's rows by `function`; UserError unless the `data` of its settings, which are taken out,
+    are today's."""
     fac.need(settings.get("data") == made_from(task, settings),
              f"data/experts/{task} or a default has changed; give the command again")
     settings.pop("data", None)
+    return function(task, seed, case, settings)
 
 
 def made_from(task, settings):
@@ -195,17 +197,11 @@ def command_students(args):
     all milliseconds anew, nothing else running."""
     config = fac.DistillConfig(**fac.preset_values(fac.DistillConfig, args.preset))
     args.steps = args.steps or config.steps
-    result = run_all(args, functools.partial(distil_student, folder=args.students),
+    result = run_all(args, functools.partial(students.distil_student, students=args.students),
                      distil_runs(args, lambda task: [
                          (args.preset, {"num_agents": fac.lookup_task(task)[3]})]))
     time_students(Path(result["out"]), args.tasks)
     return result
-
-
-def distil_student(task, seed, case, settings, folder):
-    """`students.distil_student`, of the data that the run names."""
-    need_same_data(task, settings)
-    yield from students.distil_student(task, seed, case, settings, folder)
 
 
 def time_students(path, tasks):
@@ -401,7 +397,6 @@ def online(task, seed, decisions, episodes):
 
 def follow(task, seed, case, settings):
     """train_expert.py --student fac: rows of the student's and the expert's returns."""
-    need_same_data(task, settings)
     args, _ = online(task, seed, **settings)
     args.run(args)
     with open(Path(args.out) / "curve.csv", newline="", encoding="utf-8") as file:

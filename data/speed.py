@@ -7,6 +7,8 @@ import dataclasses
 import functools
 import itertools
 import pickle
+import platform
+from pathlib import Path
 
 import numpy as np
 
@@ -26,6 +28,15 @@ ROBOTS = {
 FUNCTIONS = {"f_T": ("_dynamics",), "f_R": ("_reward",), "f_Q": ("_Q1", "_Q2")}
 TABLE3_BATCH = 512
 MODES = ("one-thread", "processes", "critical-path")
+
+
+def processor():
+    """The processor's name, where the system tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(": ")[1] for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
 
 
 class Predictor(fac.Workers):

@@ -7,7 +7,6 @@ draws them. The text is below; the numbers in it are those of the pictures.
 import dataclasses
 import functools
 import itertools
-import platform
 import sys
 import textwrap
 import time
@@ -19,7 +18,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import fac_tdmpc_ref as fac  # noqa: E402
 import plots  # noqa: E402
-from speed import multiply_adds  # noqa: E402
+from speed import multiply_adds, processor  # noqa: E402
 
 TASK, STATES = "reacher-hard", 192  # these states are held out: no student learns from them
 CONFIG = fac.DistillConfig(steps=1200, lr=3e-3, warmup=50, targets="joint", expert_episodes=0,
@@ -451,15 +450,6 @@ def draw_cost(figure, found):
            xlabel=f"time of a decision, the expert's = 1; {processor()}, one thread")
     ax.invert_yaxis()
     ax.grid(False, axis="y")
-
-
-def processor():
-    """The processor's name, where the system tells."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.split(": ")[1] for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
 
 
 PICTURES = {  # name: numbers, drawing, height in inches

@@ -14,7 +14,6 @@ import csv
 import functools
 import json
 import os
-import platform
 import sys
 import time
 from pathlib import Path
@@ -28,6 +27,7 @@ import torch.nn.functional as F  # noqa: E402
 
 import fac_tdmpc_ref as fac  # noqa: E402
 import numpy_learner  # noqa: E402
+from speed import processor  # noqa: E402
 from torch_learner import TorchLearner  # noqa: E402
 
 
@@ -300,11 +300,9 @@ def training(threads, turns, batch=256):
 
 def machine():
     """(processor, cores, BLAS kernel), which a ratio is of."""
-    info = Path("/proc/cpuinfo").read_text() if os.path.exists("/proc/cpuinfo") else ""
-    names = [line.partition(": ")[2] for line in info.splitlines() if line.startswith("model name")]
     kernels = {f"{pool['internal_api']} {pool.get('architecture', '')}".strip()
                for pool in fac._thread_pools().info() if pool["user_api"] == "blas"}
-    return (names or [platform.processor()])[0], str(fac.cores()), ", ".join(sorted(kernels))
+    return processor(), str(fac.cores()), ", ".join(sorted(kernels))
 
 
 def record(what, ratio, path=ROOT / "data" / "results" / "bench.csv"):
@@ -313,7 +311,7 @@ def record(what, ratio, path=ROOT / "data" / "results" / "bench.csv"):
     if path.exists():
         with open(path, newline="", encoding="utf-8") as file:
             rows = [row for row in csv.reader(file) if tuple(row[:-1]) != key]
-    with open(path, "w", newline="", encoding="utf-8") as file:
+    with fac.atomic_file(path, "w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows([*rows, (*key, f"{ratio:.2f}")])
 
 

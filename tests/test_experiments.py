@@ -734,12 +734,13 @@ def test_a_run_made_with_other_defaults_is_another_run(monkeypatch):
         assert experiments.main(["sweep", *flags]) == 0
     assert seen[0] == seen[1] != seen[2]
     expected = "data/experts/reacher-hard or a default has changed; give the command again"
-    assert expected in runs.attempt(experiments.distil, seen[0])[-1]["error"]
+    same = functools.partial(functools.partial, experiments.of_same_data)  # as run_all does
+    assert expected in runs.attempt(same(experiments.distil), seen[0])[-1]["error"]
     settings = {"decisions": 4000, "episodes": 1}
     before = experiments.made_from("walker-walk", {"data": 0, **settings})
     monkeypatch.setitem(train_expert.FOLLOWING_DEFAULTS, "played_share", 0.25)
     run = experiments.make_run("walker-walk", 0, "online", data=before, **settings)
-    row = runs.attempt(experiments.follow, run)[-1]
+    row = runs.attempt(same(experiments.follow), run)[-1]
     assert "a default has changed" in row["error"]
 
 
@@ -1166,7 +1167,8 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
         "plan_workers": 0, **{f"plan_ms_{who}": 1.0 for who in (
             "expert", "policy", "same_search", "student_in_process", "student")}})
     monkeypatch.setattr(experiments, "run_all", lambda args, function, own: (rows.extend(
-        row for run in own for row in runs.attempt(function, run)),
+        row for run in own for row in runs.attempt(
+            functools.partial(experiments.of_same_data, function), run)),
         {"out": tmp_path / "none.csv"})[1])
     for budget in ([], ["--iterations", "1", "--samples", "4"]):  # a copy of the student is there
         assert experiments.main([
