@@ -1070,23 +1070,31 @@ class Distiller:
 
     def step(self):
         """Lines 4 to 6 once. Returns loss, mean reward divergence, mean value divergence."""
-        size = self.config.batch_size
+        def loss(part, grads):
+            return self.loss(self.student, features[..., part], actions[:, :, part],
+                             [x[..., part, :] for x in targets], self.config, grads)
+
+        with one_thread():
+            features, actions, targets = self.batch(self.t)
+            losses = self.learn(self.optimizer, self._halves, self.config.batch_size, loss)
+            self.optimizer.step(learning_rate(self.config, self.t), self.config.grad_clip)
+        return tuple(losses.tolist())
+
+    def learn(self, optimizer, halves, size, loss):
+        """Two threads: an optimizer's gradient of the mean of loss(part, grads) over a batch of
+        this size, of which a part is half; each fills its own of `halves`, (vector, views)."""
         parts = slice(0, size // 2), slice(size // 2, size)
 
         def learn(part, half):
             (gradient, grads), fraction = half, (part.stop - part.start) / size
             gradient[:] = 0
-            losses = self.loss(self.student, features[..., part], actions[:, :, part],
-                               [x[..., part, :] for x in targets], self.config, grads)
+            losses = loss(part, grads)
             gradient *= gradient.dtype.type(fraction)
             return fraction * np.array(losses)
 
-        with one_thread():
-            features, actions, targets = self.batch(self.t)
-            losses = sum(self._threads.map(learn, parts, self._halves))
-            np.add(*(gradient for gradient, _ in self._halves), out=self.optimizer.gradient)
-            self.optimizer.step(learning_rate(self.config, self.t), self.config.grad_clip)
-        return tuple(losses.tolist())
+        losses = sum(self._threads.map(learn, parts, halves))
+        np.add(*(gradient for gradient, _ in halves), out=optimizer.gradient)
+        return losses
 
     def run(self):
         """Algorithm 1 from here to its end; yields each step's losses. UserError if they diverge.
@@ -1149,11 +1157,12 @@ class Distiller:
 class PlainDistiller(Distiller):
     """Part I's `distill` in a Distiller's place, for `distill --plain`."""
 
-    def __init__(self, expert, replay, config, num_agents=None, seed=0):
+    def __init__(self, expert, replay, config, num_agents=None, seed=0, **sizes):
         need((config.targets, config.policy_share, config.expert_episodes, config.reuse,
-              config.priors, isinstance(num_agents, str)) == ("joint", 0, 0, 1, False, False),
-             "--plain goes without --targets, --policy-share, --expert-episodes, --reuse and "
-             "--priors, and with --num-agents for --agents")
+              config.priors, isinstance(num_agents, str), sizes) == (
+                  "joint", 0, 0, 1, False, False, {}),
+             "--plain goes without --targets, --policy-share, --expert-episodes, --reuse, --priors "
+             "and --mlp-dim, and with --num-agents for --agents")
         super().__init__(expert, replay, config, num_agents, seed)
         self._plain = distill(expert, replay, config, self.student.config.num_agents, seed)
 
@@ -1434,6 +1443,9 @@ class Workers(contextlib.AbstractContextManager):
                             "debugger, at a limit (ulimit -a): pass workers=0 (--workers 0)"
                             ) from None
 
+    def __len__(self):
+        return len(self._members)
+
     def send_all(self, messages):
         """Send one of the messages to each worker, in their order."""
         for i, ((_, connection), message) in enumerate(zip(self._members, messages)):
@@ -1459,7 +1471,7 @@ class Workers(contextlib.AbstractContextManager):
 
     def receive_all(self):
         """The next message of every worker, in their order."""
-        return [self.receive(i) for i in range(len(self._members))]
+        return [self.receive(i) for i in range(len(self))]
 
     def close(self):
         """End all processes: closed pipes first, then force."""
@@ -1879,9 +1891,16 @@ def episodes_of(model, task, config, seeds, environment, noise, teacher):
 
 
 def _playing_worker(connection):
-    """Sends its episodes, one after the other."""
-    for decisions in episodes_of(*connection.recv()):
-        connection.send(decisions)
+    """Sends the episodes of each message, one after the other."""
+    while True:
+        for decisions in episodes_of(*connection.recv()):
+            connection.send(decisions)
+
+
+def players(workers, episodes):
+    """Processes that `play` [one for each core], no more than there are episodes."""
+    return Workers(_playing_worker, min(
+        episodes, cores() if workers is None else count(workers, "workers")), "evaluation worker")
 
 
 def play(model, task, config, seeds, workers=None, label="playing", environment=None, noise=0.0,
@@ -1889,21 +1908,21 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
     """Plan through the episodes of `seeds`: observations (E, T, O), actions (E, T, A), rewards
     (E, T), seconds of planning (E, T); NaN past the end of one shorter than the longest, rewards 0.
 
-    workers: processes that share the episodes [one for each core]; 0, or with an `environment`: all
-    in this one. An episode depends on its seed, not on their number. environment: instead of the
-    task's, see `robot_step`; with T as `episode_steps` if it has that. noise: each episode draws
-    the deviation of what is added to its actions, evenly from 0 to this. teacher: a PlannerConfig,
-    by which the model also plans in each state; its plans (E, T, N * L * d) are a fifth array."""
+    workers: processes that share the episodes [one for each core], or `players`; 0, or with an
+    `environment`: all in this one. An episode depends on its seed, not on their number.
+    environment: instead of the task's, see `robot_step`; with T as `episode_steps` if it has that.
+    noise: each episode draws the deviation of what is added to its actions, evenly from 0 to this.
+    teacher: a PlannerConfig, by which the model also plans in each state; its plans
+    (E, T, N * L * d) are a fifth array."""
     E, sizes, episodes, total = len(seeds), model.config, [], 0.0
-    workers = 0 if environment is not None else min(
-        E, cores() if workers is None else count(workers, "workers"))
     here = episodes_of(model, task, config, seeds, environment, noise, teacher)
-    with progress(label, E, "episode") as bar, \
-            Workers(_playing_worker, workers, "evaluation worker") as pool:
-        pool.send_all((model, task, config, seeds[w::workers], None, noise, teacher)
-                      for w in range(workers))
+    with progress(label, E, "episode") as bar, contextlib.ExitStack() as stack:
+        workers = workers if environment is None else 0
+        pool = workers if isinstance(workers, Workers) else stack.enter_context(players(workers, E))
+        pool.send_all((model, task, config, seeds[w::len(pool)], None, noise, teacher)
+                      for w in range(len(pool)))
         for i in range(E):
-            episodes.append(pool.receive(i % workers) if workers else next(here))
+            episodes.append(pool.receive(i % len(pool)) if len(pool) else next(here))
             total += sum(decision[2] for decision in episodes[i])
             bar.update()
             bar.set_postfix_str(f"mean return {total / (i + 1):.0f}", False)
@@ -2027,13 +2046,19 @@ def learn_priors(distiller, data, number):
     config = dataclasses.replace(distiller.config, lr=PRIOR_LR,
                                  steps=-(-distiller.config.steps // 4))
     adam = prior_optimizer(student)
+    halves = [flatten(adam.params) for _ in range(2)]
+
+    def loss(part, grads):
+        rows = chosen[part]
+        return prior_loss(student, x[..., rows], targets[..., rows], config.lam, grads)
+
     with one_thread(), progress("teaching priors", config.steps, "step") as bar:
         for t in range(config.steps):
             chosen = rng.integers(x.shape[-1], size=PRIOR_BATCH)
-            loss = prior_loss(student, x[..., chosen], targets[..., chosen], config.lam, adam.grads)
+            found = distiller.learn(adam, halves, PRIOR_BATCH, loss)
             adam.step(learning_rate(config, t), config.grad_clip)
             bar.update()
-    check_finite("priors' loss is", loss, config.steps, config.lr)
+    check_finite("priors' loss is", found, config.steps, config.lr)
 
 
 def choose_by_playing(distiller, task, taught, plannings, workers=None, environment=None):
@@ -2230,8 +2255,11 @@ def command_distill(args):
         "horizon": config.horizon, **({"speed": "plain"} if args.plain else {})})
     out = Path(args.out or f"runs/{args.task}-{args.seed}")
     read_records(path)  # what is damaged is missed now
+    sizes = {"mlp_dim": args.mlp_dim} if args.mlp_dim else {}
     with contextlib.closing((PlainDistiller if args.plain else Distiller)(
-            expert, replay, config, args.num_agents, args.seed)) as distiller, locked(out):
+            expert, replay, config, args.num_agents, args.seed, **sizes)) as distiller, \
+            locked(out), players(args.workers, max(args.episodes, config.expert_episodes)) as pool:
+        args.workers = pool  # all that plays from here on
         result, planning = distil_and_save(distiller, args, planning, header, out)
         obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
         found, rows = compare(compared((expert, own), (distiller.student, planning)), obs, path,
@@ -2282,10 +2310,12 @@ def distil_and_save(distiller, args, planning, header, out):
                                 for search in SEARCHES if planning.prior == "own")]
     settings = {"task": args.task, "seed": args.seed,
                 "num_agents": student.config.groups or student.config.num_agents,
-                "distill": vars(config), "action_repeat": planning.action_repeat,
+                "mlp_dim": student.config.mlp_dim, "distill": vars(config),
+                "action_repeat": planning.action_repeat,
                 "data": data_checksums(distiller.expert, distiller.replay)}
     if finished := (path := out / "student.npz").exists():
         model, about = load_model(path, ["student"])
+        about["mlp_dim"] = model.config.mlp_dim
         same_settings({key: about.get(key) for key in settings}, settings, path)
         student.params.update(prior_weights(model))
         planning = planning_of(about, path, args, speed=planning.speed)
@@ -2476,6 +2506,8 @@ def make_parser():
     agents = sub.add_mutually_exclusive_group().add_argument
     agents("--num-agents", type=int, help="N, a divisor of dim(A) [dim(A)]")
     agents("--agents", dest="num_agents", help="action dimensions of each, equally many: 0,2/1,3")
+    add("--mlp-dim", type=functools.partial(natural, least=1),
+        help="hidden width of an agent's networks [its expert's // N, at least 50]")
     add("--preset", choices=("default", "plain", "paper"), default="default", help="paper: its "
         "value of every setting that names one below (days); plain: the paper's method at this "
         "project's budget, without what it adds [D8] [D9]")

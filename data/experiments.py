@@ -32,7 +32,8 @@ import speed  # noqa: E402
 import students  # noqa: E402
 from baselines import DecodingEnvironment, distiller_of  # noqa: E402
 from runs import (  # noqa: E402
-    ROW, append_rows, finished, key_of, lock, make_all, make_run, read_rows, unique, versions)
+    append_rows, finished, key_of, lock, make_all, make_run, read_rows, unique, versions,
+    write_rows)
 from tables import (  # noqa: E402
     budget_cells, budgets_of, cell, draw_bars, draw_lines, halves, kept_cell, kept_difference, last,
     markdown, of_returns)
@@ -204,6 +205,15 @@ def command_students(args):
     return result
 
 
+def command_capacity(args):
+    """capacity: one model for all joints, taught like a student, beside a model for each."""
+    result = run_all(args, functools.partial(students.distil_student, students=args.students),
+                     distil_runs(args, lambda task: [
+                         (case, students.MODELS[case](task)) for case in args.cases]))
+    students.time_models(Path(result["out"]))
+    return result
+
+
 def time_students(path, tasks):
     """Measure milliseconds of tasks' decisions anew where some of a CSV's rows have only those of
     `distill`, which were longer beside other runs."""
@@ -228,10 +238,7 @@ def time_students(path, tasks):
                     key: ms[key] for key in ms if key.startswith(students.MEASURED)}})
                 row["ms"] = f"{ms['plan_ms_student_in_process']:.6g}"
                 row["ms_workers"] = f"{ms['plan_ms_student']:.6g}"
-        with fac.atomic_file(path, "w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, ROW, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
+        write_rows(path, rows)
 
 
 def command_sweep(args):
@@ -635,6 +642,17 @@ def report_alone(_, path, figures):
     return {"runs": len(rows)}, f"{short}\n{table}"
 
 
+def report_capacity(_, path, figures):
+    """One model for all joints beside a model for each; the figure: return against milliseconds, of
+    the priors and of two searches around them, in the episodes by which students chose."""
+    lines = {}
+    for (task, _, case, _), rows in settled(path, ()).items():
+        lines.setdefault((task, case), []).extend(rows)
+    text, panels = students.capacity_table(lines)
+    draw_lines(figures / "capacity.png", panels, "milliseconds of a decision")
+    return {"runs": len(lines)}, text
+
+
 REPORT_HEAD = """# The paper's figures, here
 
 Written by `python data/experiments.py report` from the CSVs beside it; README.md says what they
@@ -649,9 +667,10 @@ agents have 26%. One agent's layers are as wide as its expert's, N agents' an Nt
 13: latents of 50 an agent, so 50 N in all. Minutes are of a core while others distil beside it.
 
 """
-REPORTS = {"alone": report_alone, "students": report_students, "figure4": report_curves,
-           "figure5": report_curves, "figure7": report_figure7, "figure8": report_figure8,
-           "figure12": report_curves, "figure13": report_curves, "departures": report_curves}
+REPORTS = {"alone": report_alone, "students": report_students, "capacity": report_capacity,
+           "figure4": report_curves, "figure5": report_curves, "figure7": report_figure7,
+           "figure8": report_figure8, "figure12": report_curves, "figure13": report_curves,
+           "departures": report_curves}
 
 
 def command_report(args):
@@ -742,6 +761,14 @@ def make_parser():
                      help="distill's: a column of the table for each [default]")
     for name in ("steps", "samples", "iterations"):
         sub.add_argument(f"--{name}", type=positive, help="distill's [the preset's]")
+    sub = add_runs("capacity", command_capacity, "Is it the factoring? One model for all joints, "
+                   "taught like a student, beside a model for each: returns, what searches win, "
+                   "then milliseconds (keep the machine quiet for these).", [
+                       "walker-run", "quadruped-walk", "quadruped-run", "humanoid-stand",
+                       "humanoid-walk"], episodes=5)
+    sub.add_argument("--cases", nargs="+", default=[*students.MODELS], metavar="CASE",
+                     choices=[*students.MODELS], help=f"any of: {', '.join(students.MODELS)} [all]")
+    sub.add_argument("--students", default="runs", help="leave them in TASK-SEED-CASE/ [runs]")
     sub = add_runs("figure12", command_figure12, "Appendix C.1: an expert that learns and a "
                    "student that follows it.", ["reacher-easy", "walker-walk", "cheetah-run"],
                    episodes=10)

@@ -88,6 +88,14 @@ def append_rows(path, rows):
                             "what is missing") from None
 
 
+def write_rows(path, rows):
+    """Replace a CSV by these rows, which were read from it."""
+    with fac.atomic_file(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, ROW, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
 def lock(path):
     """`fac.locked` for a CSV, which is made."""
     fac.check_writable(path)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import fac_tdmpc_ref as fac
+from runs import lock, read_rows, write_rows
 from speed import useful_workers
 from tables import deviation, markdown, of_returns
 
@@ -21,12 +22,43 @@ FASTER = "speed-up, one core: over expert / the same search"
 HEADS = ("seeds", "MPPI", "student", KEPT, "least kept", WINS,
          "the same search with the expert: kept", FASTER,
          "rank correlation of G, H = 0 / last", "minutes")
-FLAGS = {"samples": "plan-samples", "iterations": "plan-iterations", "num_agents": "num-agents"}
+FLAGS = {"samples": "plan-samples", "iterations": "plan-iterations", "num_agents": "num-agents",
+         "mlp_dim": "mlp-dim"}
+PRESETS = "default", "plain", "paper"
 
 
-def folder(students, task, seed, preset):
-    """Where `distill` leaves a student: TASK-SEED, its own default, or TASK-SEED-PRESET."""
-    return Path(students) / "-".join([task, str(seed), *[preset][:preset != "default"]])
+def folder(students, task, seed, case):
+    """Where `distill` leaves a student: TASK-SEED, its own default, or TASK-SEED-CASE."""
+    name = "" if case in ("default", FACTORED) else "-" + case.replace(",", "").replace(" ", "-")
+    return Path(students) / f"{task}-{seed}{name}"
+
+
+def sizes_of(task, num_agents=None, mlp_dim=None):
+    """A student's sizes, as `distill` makes it."""
+    expert, _ = fac.load_model(fac.data_file(task, "expert.npz"))
+    config = fac.DistillConfig()
+    sizes = fac.student_config(expert.config, num_agents, config.encoder_input, config.horizon + 1)
+    return dataclasses.replace(sizes, mlp_dim=mlp_dim or sizes.mlp_dim)
+
+
+def weights(sizes):
+    """How many there are, without biases, behind a model's encoders."""
+    return sum(int(np.prod(shape)) for name, _, _, shape, _ in fac.layers(sizes)
+               if not name.endswith("_encoder"))
+
+
+def equal_width(task):
+    """The hidden width with which one model for all joints has as many weights as a model for each
+    have together."""
+    goal, one = weights(sizes_of(task)), sizes_of(task, 1)
+    return min(range(1, 1024), key=lambda width: abs(goal - weights(
+        dataclasses.replace(one, mlp_dim=width))))
+
+
+FACTORED = "a model for each joint"
+MODELS = {FACTORED: lambda task: {"num_agents": fac.lookup_task(task)[3]},
+          "one model, equal weights": lambda task: {"num_agents": 1, "mlp_dim": equal_width(task)},
+          "one model, 512 wide": lambda task: {"num_agents": 1, "mlp_dim": 512}}
 
 
 def compared(expert, student):
@@ -76,11 +108,12 @@ def argue(args, chosen):
     return found
 
 
-def distil_student(task, seed, preset, settings, students):
+def distil_student(task, seed, case, settings, students):
     """Distil a student by `distill`, which leaves it in `students`, once; a row for each evaluation
-    seed. settings: of FLAGS, `steps` and `episodes`."""
+    seed. case: a preset, or one of MODELS; settings: of FLAGS, `steps` and `episodes`."""
     flags = [f"--{FLAGS.get(name, name)}={value}" for name, value in settings.items()]
-    out = default = folder(students, task, seed, preset)
+    out = default = folder(students, task, seed, case)
+    preset = case if case in PRESETS else "default"
     if budget := [f"{k}-{settings[k]}" for k in ("samples", "iterations") if k in settings]:
         out = default.with_name("-".join([default.name, *budget]))  # whose search is another
         if default.exists() and not out.exists():
@@ -131,9 +164,13 @@ def wins(rows, key="returns", over="policy_returns"):
 
 def difference(rows, key="returns", over="policy_returns"):
     """`wins`, its mean and its error."""
-    found = np.concatenate([
+    return mean_and_error(np.concatenate([
         [np.subtract(returns(row, key), returns(row, over)) for row in rows[seed]]
-        for seed in sorted(rows)], 1)  # (students, episodes)
+        for seed in sorted(rows)], 1))
+
+
+def mean_and_error(found):
+    """Of values (students, episodes) the mean, and its error as in `wins`."""
     errors = [x.std(ddof=1) / len(x) ** 0.5 for x in (found.mean(0), found.mean(1)) if len(x) > 1]
     return found.mean(), np.hypot.reduce(errors)
 
@@ -245,3 +282,75 @@ def alone_tables(lines):
             markdown(["task", "N", "rows", "expert", "its policy alone", "priors alone", "student",
                       "expert, same search", "kept", "its search", "ms: expert",
                       "ms: student"], whole))
+
+
+# ----------------------------------------------------------- one model for all joints beside N
+
+def time_models(path):
+    """Milliseconds of the priors alone and of each search, of all models in a CSV that aren't
+    timed, one beside the other; nothing else should run."""
+    with lock(path):
+        rows, models = read_rows(path), {}
+        for row in rows:
+            if row["ranks"] and "ms_by_search" not in json.loads(row["ranks"]):
+                about = json.loads(row["settings"])
+                models.setdefault(row["task"], {})[about["num_agents"], about.get("mlp_dim")] = []
+        for task, found in models.items():
+            for sizes, calls in found.items():
+                model = fac.WorldModel.create(sizes_of(task, *sizes), np.random.default_rng(0))
+                obs = np.zeros(model.config.dim_obs, fac.F32)
+                calls += [functools.partial(fac.Planner(model, planning).act, obs)
+                          for planning in searches()]
+            ms = 1e3 * np.median(fac.interleaved_seconds(sum(found.values(), []), 20, task), 0)
+            models[task] = dict(zip(found, ms.reshape(len(found), -1).tolist()))
+        for row in rows:
+            about = json.loads(row["settings"])
+            sizes = about.get("num_agents"), about.get("mlp_dim")
+            if sizes in models.get(row["task"], {}) and row["ranks"]:
+                row["ranks"] = json.dumps({"ms_by_search": models[row["task"]][sizes],
+                                           **json.loads(row["ranks"])})
+        write_rows(path, rows)
+
+
+def searches():
+    """The PlannerConfigs that a student chooses from."""
+    return [fac.PlannerConfig(**{**fac.STUDENT_PLANNING, **search}) for search in fac.SEARCHES]
+
+
+def played_by_search(row):
+    """Returns (4, episodes), of the priors that a student kept and of each search around them, in
+    the episodes by which it chose."""
+    played = json.loads(row["ranks"])["played"]
+    taught = played[-1]["taught"]
+    return np.array([of["returns"] for of in played if of["taught"] == taught])
+
+
+def capacity_table(lines):
+    """What one model for all joints wins and costs beside a model for each; what searching wins
+    over the priors is of the episodes by which a student chose. lines: {(task, model): rows}."""
+    found, panels = [], {}
+    for (task, model), rows in lines.items():
+        first = [row for row in rows if int(row["evaluation_seed"]) == EVALUATION_SEEDS[0]]
+        about, settings = json.loads(first[0]["ranks"]), json.loads(first[0]["settings"])
+        sizes = sizes_of(task, settings["num_agents"], settings.get("mlp_dim"))
+        by_search = np.stack([*map(played_by_search, first)], 1)  # (4, students, episodes)
+        over_expert = {seed: [row for row in rows if int(row["evaluation_seed"]) == seed]
+                       for seed in EVALUATION_SEEDS}
+        _, error = difference(over_expert, over="expert_returns")
+        expert, student = (overall(rows, key) for key in ("expert_returns", "returns"))
+        found.append([
+            task, model, sizes.mlp_dim, f"{weights(sizes) / 1e3:.0f}k", len(first),
+            f"{expert:.0f}", f"{student:.0f} ± {error:.0f}", f"{by_search[0].mean():.0f}",
+            *("{:+.0f} ± {:.0f}".format(*mean_and_error(of - by_search[0]))
+              for of in by_search[1:]),
+            " / ".join(f"{measured(first, lambda x, h=h: x['rank_correlation_returns'][h]):.2f}"
+                       for h in (0, -1)),
+            " / ".join(f"{ms:.2f}" for ms in about["ms_by_search"][:3]),
+            f"{np.mean([float(row['minutes']) for row in first]):.0f}"])
+        panels.setdefault(task, ({}, None))[0][model] = {
+            ms: of.mean(1).tolist() for ms, of in zip(about["ms_by_search"][:3], by_search)}
+    searched = ["{samples} x {iterations}, {max_std} - priors".format_map(vars(of))
+                for of in searches()[1:]]
+    return markdown(["task", "models", "width", "weights", "students", "expert", "student",
+                     "priors", *searched, "rank of G, H = 0 / last", "ms: priors / 16 x 2 / 32 x 3",
+                     "minutes"], found), panels

@@ -131,7 +131,7 @@ def test_help_teaches():
     (commands,) = (a.choices for a in parser._actions if isinstance(a.choices, dict))
     assert set(commands) == {"table3", "figure4", "figure5", "figure6", "figure7", "figure8",
                              "figure9", "figure12", "figure13", "departures", "sweep", "students",
-                             "agreement", "watch", "report"}
+                             "capacity", "agreement", "watch", "report"}
     assert commands.pop("figure6") is commands["table3"]
     assert all(name in parser.format_help() for name in commands)
     for name, command in commands.items():
@@ -1151,6 +1151,61 @@ def test_what_each_joint_wins_alone_is_told_in_two_tables(tmp_path):
                       "none", "9.0", "2.0"],
                      ["cheetah-run", "6", "2", "160", "100", "70", "150", "115", "0.94 ± 0.11",
                       "32 x 3, 0.15", "9.0", "2.0"]]
+
+
+def test_one_model_for_all_joints_has_as_many_weights_as_a_model_for_each():
+    for task, width in (("walker-run", 241), ("humanoid-walk", 300)):
+        assert students.MODELS["one model, equal weights"](task) == {"num_agents": 1,
+                                                                     "mlp_dim": width}
+        each, one = students.sizes_of(task), students.sizes_of(task, 1, width)
+        assert abs(students.weights(one) / students.weights(each) - 1) < 0.005
+        assert each.num_agents == each.dim_action and one.num_agents == 1
+    student = fac.WorldModel.create(students.sizes_of("reacher-easy"), np.random.default_rng(0))
+    assert students.weights(student.config) == sum(
+        value.size for key, value in student.params.items()
+        if "encoder" not in key and key.endswith("weight"))
+
+
+def test_capacity_is_timed_once_and_told_in_a_table(tmp_path, monkeypatch):
+    """Two students of a model for each joint, one of one model; a search wins over the priors that
+    it searches around, not over those that the policy taught."""
+    def rows(kept, narrow):
+        played = [{"taught": taught, "iterations": iterations, "max_std": std, "returns": found}
+                  for taught, iterations, std, found in (
+                      ("policy", 0, 1.0, [0.0, 0.0]), ("plans", 0, 1.0, kept),
+                      ("plans", 2, 0.15, kept), ("plans", 3, 0.15, narrow),
+                      ("plans", 3, 1.0, kept))]
+        return [{"step": 9, "return_mean": 150.0, "returns": [160.0, 140.0], "minutes": 6.0,
+                 "expert_returns": [200.0, 120.0], "evaluation_seed": seed, "ranks": {
+                     "played": played, "rank_correlation_returns": [0.9, 0.7, 0.5]}}
+                for seed in (102, 101)]
+
+    write_rows(path := tmp_path / "capacity.csv", [
+        ("walker-run", 0, students.FACTORED, {"num_agents": 6}, rows([10.0, 30.0], [30.0, 70.0])),
+        ("walker-run", 1, students.FACTORED, {"num_agents": 6}, rows([20.0, 20.0], [40.0, 80.0])),
+        ("walker-run", 0, "one model, equal weights", {"num_agents": 1, "mlp_dim": 241},
+         rows([50.0, 50.0], [49.0, 49.0]))])
+    timed = []
+
+    def seconds(calls, *_):
+        timed.append([call() for call in calls])
+        return np.arange(1.0, len(calls) + 1)[None] / 1e3
+
+    monkeypatch.setattr(fac, "interleaved_seconds", seconds)
+    for _ in range(2):
+        students.time_models(path)
+    assert [len(calls) for calls in timed] == [8, 0][:len(timed)]  # two models, four searches
+    result, text = experiments.report_capacity("capacity", path, tmp_path)
+    each, one = ([cell.strip() for cell in line.split("|")[1:-1]] for line in
+                 text.splitlines()[2:])
+    # narrow - priors: 20, 40 and 20, 60: students' means 30 and 40, an error of 5; episodes' 20 and
+    # 50, one of 15
+    assert each == ["walker-run", students.FACTORED, "85", "376k", "2", "160", "150 ± 17", "20",
+                    "+0 ± 0", "+35 ± 16", "+0 ± 0", "0.90 / 0.50", "1.00 / 2.00 / 3.00", "6"]
+    assert one[1:4] == ["one model, equal weights", "241", "375k"]
+    assert one[7:11] == ["50", "+0 ± 0", "-1 ± 0", "+0 ± 0"]
+    assert one[12] == "5.00 / 6.00 / 7.00"
+    assert result == {"runs": 2} and (tmp_path / "capacity.png").exists()
 
 
 def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkeypatch):

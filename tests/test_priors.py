@@ -108,11 +108,14 @@ def test_agents_learn_their_own_part_of_the_plan_alone():
 def test_algorithm_1_and_the_priors_leave_each_other_s_weights_alone(replay):
     """All of them learned by one student; the expert's are nobody's."""
     before, _ = distilled(replay, CONFIG, 0)
-    distiller, _ = distilled(replay, CONFIG, 30)
+    distiller = fac.Distiller(before.expert, replay, CONFIG)
+    for _ in range(30):
+        distiller.step()
     start = {k: v.copy() for k, v in before.student.params.items()}
     first = {k: v.copy() for k, v in distiller.student.params.items()}
     state = {k: np.copy(v) for k, v in distiller.state().items()}
-    fac.teach_priors(distiller, None, fac.PlannerConfig(**fac.STUDENT_PLANNING))
+    with contextlib.closing(distiller):
+        fac.teach_priors(distiller, None, fac.PlannerConfig(**fac.STUDENT_PLANNING))
     unchanged = {"_reward.4.bias", "_Q1.5.bias", "_Q2.5.bias"}  # a softmax sees no constant
     for key, value in distiller.student.params.items():
         prior, frozen = key.startswith("_prior"), key.startswith("_expert")
