@@ -141,15 +141,18 @@ def failed(run, error):
 
 def in_process(function, run):
     """`attempt` in a process of its own, so that one that dies takes no other run with it."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), begin) as pool:
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), begin,
+                             (os.getpid(),)) as pool:
         return pool.submit(attempt, function, run).result()
 
 
-def begin():
+def begin(parent):
     """In a run's process: it shows no bars, and ends with the one that waits for it."""
     os.environ["TQDM_DISABLE"] = "1"
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG, SIGKILL
+    if os.getppid() != parent:  # it has ended already
+        os._exit(1)
 
 
 def in_processes(function, runs, jobs):
