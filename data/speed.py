@@ -3,6 +3,7 @@
 `experiments.py table3` runs it, or `figure6`. Speed doesn't depend on what a model has learned.
 """
 import contextlib
+import csv
 import dataclasses
 import functools
 import itertools
@@ -37,6 +38,25 @@ def processor():
         return next(line.split(": ")[1] for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         return platform.processor() or platform.machine()
+
+
+def machine():
+    """(processor, cores, BLAS kernel), which a time is of."""
+    kernels = {f"{pool['internal_api']} {pool.get('architecture', '')}".strip()
+               for pool in fac._thread_pools().info() if pool["user_api"] == "blas"}
+    return processor(), str(fac.cores()), ", ".join(sorted(kernels))
+
+
+def record(path, column, found):
+    """Keep (what, number)s of this machine in a CSV, in place of earlier ones."""
+    rows, mine = [], {(*machine(), what): f"{number:.2f}" for what, number in found}
+    if Path(path).exists():
+        with open(path, newline="", encoding="utf-8") as file:
+            rows = [row for row in list(csv.reader(file))[1:] if tuple(row[:-1]) not in mine]
+    with fac.atomic_file(path, "w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows([
+            ("processor", "cores", "blas", "what", column), *rows,
+            *((*key, number) for key, number in mine.items())])
 
 
 class Predictor(fac.Workers):
@@ -211,6 +231,10 @@ def command_table3(args):
               "handover_us": float(np.median(hand_overs)) if hand_overs else None,
               "cores": fac.cores()}
     print_benchmark(result, args.robots)
+    if args.record:
+        record(args.record, "ms", [
+            ("{robot}, {model}, {preset}, {samples} x {iterations}, {mode}".format_map(row),
+             row["ms_median"]) for row in decision])
     if args.figure:
         plots.drawn(draw_prediction, args.figure, prediction, args.robots)
     return result
@@ -277,5 +301,7 @@ def add_commands(commands):
     sub.add_argument("--runs", type=functools.partial(fac.natural, least=10), default=100,
                      help="timings; of decisions a tenth [100]")
     sub.add_argument("--figure", help="draw it into this file [figure6: data/figures/figure6.png]")
+    sub.add_argument("--record", metavar="CSV", help="keep the milliseconds of decisions there, in "
+                     "place of this machine's earlier ones")
     fac.add_config(sub, fac.PlannerConfig, skip=("pi_trajs", "action_repeat"),
                    **fac.preset_values(fac.PlannerConfig, "paper"))

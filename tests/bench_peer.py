@@ -10,7 +10,6 @@ data/results/bench.csv, in place of this machine's earlier ones.
 """
 import argparse
 import contextlib
-import csv
 import functools
 import json
 import os
@@ -27,7 +26,7 @@ import torch.nn.functional as F  # noqa: E402
 
 import fac_tdmpc_ref as fac  # noqa: E402
 import numpy_learner  # noqa: E402
-from speed import processor  # noqa: E402
+from speed import machine, record  # noqa: E402
 from torch_learner import TorchLearner  # noqa: E402
 
 
@@ -298,23 +297,6 @@ def training(threads, turns, batch=256):
                         for learner in (ours, theirs)), turns)
 
 
-def machine():
-    """(processor, cores, BLAS kernel), which a ratio is of."""
-    kernels = {f"{pool['internal_api']} {pool.get('architecture', '')}".strip()
-               for pool in fac._thread_pools().info() if pool["user_api"] == "blas"}
-    return processor(), str(fac.cores()), ", ".join(sorted(kernels))
-
-
-def record(what, ratio, path=ROOT / "data" / "results" / "bench.csv"):
-    """Keep a ratio of this machine, in place of an earlier one."""
-    rows, key = [("processor", "cores", "blas", "what", "ratio")], (*machine(), what)
-    if path.exists():
-        with open(path, newline="", encoding="utf-8") as file:
-            rows = [row for row in csv.reader(file) if tuple(row[:-1]) != key]
-    with fac.atomic_file(path, "w", newline="", encoding="utf-8") as file:
-        csv.writer(file, lineterminator="\n").writerows([*rows, (*key, f"{ratio:.2f}")])
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--turns", type=functools.partial(fac.natural, least=1), default=9,
@@ -334,7 +316,7 @@ def main():
         print(f"{what:<42}{many:<10} NumPy {found[1] / per:7.1f} ms"
               f"  {peer} {found[2] / per:7.1f} ms  ratio {found[0]:.2f}", flush=True)
         if args.record and peer == "PyTorch" and "compile" not in what:
-            record(f"{what}, {many}", found[0])
+            record(fac.DATA / "results" / "bench.csv", "ratio", [(f"{what}, {many}", found[0])])
         return found[0]
 
     result["central_ratio"] = show("plan, TD-MPC (N = 1, latent 512)", planning(1, 6, args.turns))

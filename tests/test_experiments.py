@@ -108,11 +108,19 @@ def test_table3_measures_every_mode(tmp_path, monkeypatch):
 
 def test_table3_without_workers_and_with_a_budget_of_its_own(tmp_path, monkeypatch):
     monkeypatch.setattr(speed, "TABLE3_BATCH", 16)
-    found = last_json(here("table3", "--robots", "reacher", "reacher", "--runs", "10",
-                           "--samples", "128", "--iterations", "2", "--workers", "0", "--json",
-                           cwd=tmp_path))
+    (path := tmp_path / "x.csv").write_text("processor,cores,blas,what,ms\nother,1,x,y,5.00\n")
+    for _ in range(2):  # the second's in place of the first's
+        found = last_json(here("table3", "--robots", "reacher", "reacher", "--runs", "10",
+                               "--samples", "128", "--iterations", "2", "--workers", "0",
+                               "--record", "x.csv", "--json", cwd=tmp_path))
     assert found["handover_us"] is None
     assert len(found["prediction"]) == 18 and len(found["decision"]) == 2 * 4
+    head, other, *rows = csv.reader(path.read_text().splitlines())
+    assert (head[3:], other) == (["what", "ms"], ["other", "1", "x", "y", "5.00"])
+    assert [row[3:] for row in rows] == [
+        ["{robot}, {model}, {preset}, 128 x 2, {mode}".format_map(of), f"{of['ms_median']:.2f}"]
+        for of in found["decision"]]
+    assert {tuple(row[:3]) for row in rows} == {speed.machine()}
 
 
 def test_multiply_adds_count_the_weights_of_equation_2():
