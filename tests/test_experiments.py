@@ -1,5 +1,6 @@
 """data/experiments.py: the paper's tables as users run them, small."""
 import contextlib
+import csv
 import dataclasses
 import functools
 import importlib.util
