@@ -2,7 +2,7 @@
 
 A TD-MPC expert (encoder, dynamics, reward, value; planning by MPPI in latent space) is distilled
 into a student whose latent, dynamics, reward and value fall apart into one small model for each
-action dimension. Each joint then plans alone: cheaper, and in parallel.
+action dimension. Each joint then acts and plans alone: cheaper, and in parallel.
 
     python fac_tdmpc_ref.py distill --task reacher-hard
 
@@ -372,8 +372,8 @@ class WorldModel:
         return "_pi.0.weight" in self.params
 
     def latents(self, obs, search=True):
-        """All that agents know when they plan, obs (O, B) -> (N, m, B): s^i; with priors of their
-        own (N, 2 m, B): below s^i, which is left out without a search, what P^i reads [D9]."""
+        """All that agents know when they plan, obs (O, B) -> (N, m, B): s^i. With priors of their
+        own: rows :m are s^i, rows m:2m what P^i reads, without a search these alone [D9]."""
         x, own = self.read(obs), self.config.prior_steps > 0
         names = ["_encoder"] * (search or not own) + ["_prior_encoder"] * own
         return np.concatenate([self.encode_features(x, name=name) for name in names], 1)
@@ -454,7 +454,7 @@ def heads_backward(model, tapes, d_shares, grads):
     by each share (N, L, B, K), or by sums of shares (fewer rows), the same for each summand."""
     n, dx = model.config.num_agents, 0
     for name, dy in zip(HEADS, d_shares):
-        dy = np.repeat(dy, n // len(dy), 0).reshape(n, 1, -1)
+        dy = np.repeat(dy, n // len(dy), 0).reshape(n, 1, -1)  # a joint target's: N times
         dx += model.backward(name, tapes[name], dy, grads)
     return dx
 
@@ -522,7 +522,7 @@ def divergences(heads, targets, config, divergence=soft_kl):
     coefs = (config.reward_coef, config.value_coef, config.value_coef)
     for coef, shares, target in zip(coefs, heads, targets):
         target = target.reshape(-1, L, B, K)  # one row: all agents', joint; N: each its own
-        output = shares.reshape(len(target), -1, L, B, K).sum(1)  # the sum, or shares as they are
+        output = shares.reshape(len(target), -1, L, B, K).sum(1)  # (1, N, ...): N; (N, 1, ...): 1
         kl, d_output = divergence(output, target, config.temperature_student,
                                   config.temperature_expert, config.kl)
         loss += coef * float((lam * kl).sum())
@@ -532,8 +532,8 @@ def divergences(heads, targets, config, divergence=soft_kl):
 
 
 def new_student(expert, config, seed):
-    """(Adam, student): a student with fresh weights, and Adam on those that Algorithm 1 learns,
-    views of its vector, which each of its steps changes. The expert's are the expert's arrays."""
+    """(Adam, student): a student with fresh weights, and Adam on those that Algorithm 1 learns: the
+    student's arrays are views of Adam's vector. The frozen encoder's are the expert's arrays."""
     student = WorldModel.create(config, stream(seed, "student"))
     frozen = {k: expert.params[k[len("_expert"):]] for k in student.params
               if k.startswith("_expert")}
@@ -573,12 +573,12 @@ def distill(expert, replay, config, num_agents=None, seed=0):
     optimizer, student = new_student(expert, sizes, seed)
     starts, _ = replay.starts(config.horizon + 1, config.held_out, seed)
     for t in range(config.steps):                                                       # line 3
-        rng = stream(seed, f"pool {t}")  # Part II's name: a test compares the two
+        rng = stream(seed, f"pool {t}")  # as Part II's, whose first pools are the same
         rows = rng.choice(starts, config.batch_size)
         obs, actions = replay.sequences(rows, config.horizon + 1)                       # line 4
         batch = perturbed_batch(expert, student, obs, actions[..., None], config, rng)
         losses = distill_loss(student, *batch, config, optimizer.grads)                 # line 6
-        optimizer.step(learning_rate(config, t), config.grad_clip)                      # line 5
+        optimizer.step(learning_rate(config, t), config.grad_clip)                      # its line 5
         yield student, losses
 
 
@@ -878,7 +878,7 @@ def credit(expert, tapes, actions, predicted, sizes):
     """Each agent's part of what perturbing actions does to the expert's predictions.
 
     Copy 0 is unperturbed. Along the line from its actions to copy k's a prediction y changes by the
-    integral of its gradient g, which is a sum over agents. With the line's two ends for the line:
+    integral of its gradient g, which is a sum over agents. By the trapezoidal rule, agent i's is
 
         part^i(y_h)_k = sum_{j <= h} (a_j^i,k - a_j^i,0) . (g_j^i,k + g_j^i,0) / 2,  g_j = dy_h/da_j
 
@@ -893,7 +893,7 @@ def credit(expert, tapes, actions, predicted, sizes):
     d_reward, *d_q = (expert.backward(name, tapes[name], half, None) for name in HEADS)
     dx = np.concatenate([2 * d_reward, sum(d_q)]).reshape(2, m + A, L, B * K)
     way = (actions - actions[..., :1]) / 2
-    parts, d = np.zeros((L, 2, A, B, K), actions.dtype), dx[:0, :, 0]
+    parts, d = np.zeros((L, 2, A, B, K), actions.dtype), dx[:0, :, 0]  # d: empty
     for j in reversed(range(L)):
         if j < L - 1:  # of outputs at h > j, through s_j+1: each on the axis that agents have
             d = expert.backward("_dynamics", tapes[f"_dynamics {j}"], d[:, :m], None)
