@@ -2248,7 +2248,7 @@ def command_distill(args):
         **preset_values(DistillConfig, named), **({"reuse": 1} if args.plain else {})})
     expert, header, replay, path = load_data(args)
     theirs = {**preset_values(PlannerConfig, named), **made_for(header, path)}
-    own = PlannerConfig(**theirs)  # the expert's
+    Planner(expert, own := PlannerConfig(**theirs))  # what it lacks is missed now
     search = student_planning(config) if getattr(args, "PlannerConfig.prior") != "last" else {}
     planning = from_args(PlannerConfig, args, **{
         **theirs, **(search and {"elites": 0, "min_std": PlannerConfig.min_std}), **search,
@@ -2274,9 +2274,8 @@ def command_distill(args):
         print(f"\nits search was chosen by playing {len(played[0]['returns'])} episodes of the "
               "run's own seeds:\n")
         print_table([("priors taught", "MPPI", "first deviation", "return"), *(
-            (of["taught"], *((f"{of['samples']} x {of['iterations']}", f"{of['max_std']}")
-                             if of["iterations"] else ("0", "-")), f"{np.mean(of['returns']):.0f}")
-            for of in played)])
+            (of["taught"], budget(of), f"{of['max_std']}" if of["iterations"] else "-",
+             f"{np.mean(of['returns']):.0f}") for of in played)])
     kept = "-" if result["kept"] is None else f"{result['kept']:.2f}"
     print(f"\nreturn kept {kept}, rank correlation of the return "
           f"{result['rank_correlation_returns'][-1]:.3f}; Algorithm 1 distilled in "
@@ -2394,10 +2393,14 @@ def compare(each, obs, path, args):
                  "horizon": planning.horizon, "recorded": recorded, "versions": versions}
         found.update({f"{name}_{key}": value for key, value in about.items()})
         found[f"plan_ms_{name}"], found["speedup"] = ms, float(timed[0]) / ms
-        search = f"{planning.samples} x {planning.iterations}" if planning.iterations else "0"
-        rows.append((COMPARED[name] + source, search, f"{mean:.0f} ± {std:.0f}", f"{ms:.1f}",
-                     f"{found['speedup']:.1f}"))
+        rows.append((COMPARED[name] + source, budget(vars(planning)), f"{mean:.0f} ± {std:.0f}",
+                     f"{ms:.1f}", f"{found['speedup']:.1f}"))
     return {**found, "kept": return_kept(mean, found["expert_return_mean"])}, rows
+
+
+def budget(search):
+    """S x I of a search's settings, a dict; 0: none."""
+    return "{samples} x {iterations}".format_map(search) if search["iterations"] else "0"
 
 
 def return_kept(student, expert):
