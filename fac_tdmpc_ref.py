@@ -1085,14 +1085,14 @@ class Distiller:
         this size, of which a part is half; each fills its own of `halves`, (vector, views)."""
         parts = slice(0, size // 2), slice(size // 2, size)
 
-        def learn(part, half):
+        def fill(half, part):
             (gradient, grads), fraction = half, (part.stop - part.start) / size
             gradient[:] = 0
             losses = loss(part, grads)
             gradient *= gradient.dtype.type(fraction)
             return fraction * np.array(losses)
 
-        losses = sum(self._threads.map(learn, parts, halves))
+        losses = sum(self._threads.map(fill, halves, parts))
         np.add(*(gradient for gradient, _ in halves), out=optimizer.gradient)
         return losses
 
