@@ -209,7 +209,8 @@ def command_capacity(args):
     """capacity: one model for all joints, taught like a student, beside a model for each."""
     result = run_all(args, functools.partial(students.distil_student, students=args.students),
                      distil_runs(args, lambda task: [
-                         (case, students.MODELS[case](task)) for case in args.cases]))
+                         (case, {"num_agents": 1, "mlp_dim": students.ONE_MODEL[case](task)})
+                         for case in args.cases]))
     students.time_models(Path(result["out"]))
     return result
 
@@ -643,14 +644,16 @@ def report_alone(_, path, figures):
 
 
 def report_capacity(_, path, figures):
-    """One model for all joints beside a model for each; the figure: return against milliseconds, of
-    the priors and of two searches around them, in the episodes by which students chose."""
-    lines = {}
-    for (task, _, case, _), rows in settled(path, ()).items():
-        lines.setdefault((task, case), []).extend(rows)
-    text, panels = students.capacity_table(lines)
+    """One model for all joints beside alone.csv's model for each; the figure: return against
+    milliseconds, of the priors and of two searches around them, in the episodes of the choice."""
+    tasks = {task: {"default": []} for task, *_ in settled(path)}
+    for (task, _, case, _), rows in [*settled(path.with_name("alone.csv")).items(),
+                                     *settled(path).items()]:
+        if task in tasks:
+            tasks[task].setdefault(case, []).extend(rows)
+    text, panels = students.capacity_table(tasks)
     draw_lines(figures / "capacity.png", panels, "milliseconds of a decision")
-    return {"runs": len(lines)}, text
+    return {"tasks": [*tasks]}, text
 
 
 REPORT_HEAD = """# The paper's figures, here
@@ -762,12 +765,13 @@ def make_parser():
     for name in ("steps", "samples", "iterations"):
         sub.add_argument(f"--{name}", type=positive, help="distill's [the preset's]")
     sub = add_runs("capacity", command_capacity, "Is it the factoring? One model for all joints, "
-                   "taught like a student, beside a model for each: returns, what searches win, "
-                   "then milliseconds (keep the machine quiet for these).", [
+                   "taught like a student (report: beside these, alone.csv): returns, then "
+                   "milliseconds (keep the machine quiet for these).", [
                        "walker-run", "quadruped-walk", "quadruped-run", "humanoid-stand",
                        "humanoid-walk"], episodes=5)
-    sub.add_argument("--cases", nargs="+", default=[*students.MODELS], metavar="CASE",
-                     choices=[*students.MODELS], help=f"any of: {', '.join(students.MODELS)} [all]")
+    sub.add_argument("--cases", nargs="+", default=[*students.ONE_MODEL], metavar="CASE",
+                     choices=[*students.ONE_MODEL],
+                     help=f"any of: {'; '.join(students.ONE_MODEL)} [all]")
     sub.add_argument("--students", default="runs", help="leave them in TASK-SEED-CASE/ [runs]")
     sub = add_runs("figure12", command_figure12, "Appendix C.1: an expert that learns and a "
                    "student that follows it.", ["reacher-easy", "walker-walk", "cheetah-run"],

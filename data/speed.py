@@ -302,6 +302,6 @@ def add_commands(commands):
                      help="timings; of decisions a tenth [100]")
     sub.add_argument("--figure", help="draw it into this file [figure6: data/figures/figure6.png]")
     sub.add_argument("--record", metavar="CSV", help="keep the milliseconds of decisions there, in "
-                     "place of this machine's earlier ones")
+                     "place of this machine's earlier ones [none]")
     fac.add_config(sub, fac.PlannerConfig, skip=("pi_trajs", "action_repeat"),
                    **fac.preset_values(fac.PlannerConfig, "paper"))

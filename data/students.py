@@ -29,7 +29,7 @@ PRESETS = "default", "plain", "paper"
 
 def folder(students, task, seed, case):
     """Where `distill` leaves a student: TASK-SEED, its own default, or TASK-SEED-CASE."""
-    name = "" if case in ("default", FACTORED) else "-" + case.replace(",", "").replace(" ", "-")
+    name = "" if case == "default" else "-" + case.replace(",", "").replace(" ", "-")
     return Path(students) / f"{task}-{seed}{name}"
 
 
@@ -55,10 +55,7 @@ def equal_width(task):
         dataclasses.replace(one, mlp_dim=width))))
 
 
-FACTORED = "a model for each joint"
-MODELS = {FACTORED: lambda task: {"num_agents": fac.lookup_task(task)[3]},
-          "one model, equal weights": lambda task: {"num_agents": 1, "mlp_dim": equal_width(task)},
-          "one model, 512 wide": lambda task: {"num_agents": 1, "mlp_dim": 512}}
+ONE_MODEL = {"one model, equal weights": equal_width, "one model, 512 wide": lambda task: 512}
 
 
 def compared(expert, student):
@@ -110,7 +107,7 @@ def argue(args, chosen):
 
 def distil_student(task, seed, case, settings, students):
     """Distil a student by `distill`, which leaves it in `students`, once; a row for each evaluation
-    seed. case: a preset, or one of MODELS; settings: of FLAGS, `steps` and `episodes`."""
+    seed. case: a preset, or one of ONE_MODEL; settings: of FLAGS, `steps` and `episodes`."""
     flags = [f"--{FLAGS.get(name, name)}={value}" for name, value in settings.items()]
     out = default = folder(students, task, seed, case)
     preset = case if case in PRESETS else "default"
@@ -287,29 +284,29 @@ def alone_tables(lines):
 # ----------------------------------------------------------- one model for all joints beside N
 
 def time_models(path):
-    """Milliseconds of the priors alone and of each search, of all models in a CSV that aren't
-    timed, one beside the other; nothing else should run."""
+    """Milliseconds of a decision, by the priors alone and by each search, of all models in a CSV
+    that aren't timed, beside a model for each joint; nothing else should run."""
     with lock(path):
-        rows, models = read_rows(path), {}
+        rows, found = read_rows(path), {}
         for row in rows:
-            if row["ranks"] and "ms_by_search" not in json.loads(row["ranks"]):
-                about = json.loads(row["settings"])
-                models.setdefault(row["task"], {})[about["num_agents"], about.get("mlp_dim")] = []
-        for task, found in models.items():
-            for sizes, calls in found.items():
-                model = fac.WorldModel.create(sizes_of(task, *sizes), np.random.default_rng(0))
-                obs = np.zeros(model.config.dim_obs, fac.F32)
-                calls += [functools.partial(fac.Planner(model, planning).act, obs)
-                          for planning in searches()]
-            ms = 1e3 * np.median(fac.interleaved_seconds(sum(found.values(), []), 20, task), 0)
-            models[task] = dict(zip(found, ms.reshape(len(found), -1).tolist()))
-        for row in rows:
-            about = json.loads(row["settings"])
-            sizes = about.get("num_agents"), about.get("mlp_dim")
-            if sizes in models.get(row["task"], {}) and row["ranks"]:
-                row["ranks"] = json.dumps({"ms_by_search": models[row["task"]][sizes],
-                                           **json.loads(row["ranks"])})
+            if row["ranks"] and "ms_by_search" not in (about := json.loads(row["ranks"])):
+                width = json.loads(row["settings"])["mlp_dim"]
+                if (key := (row["task"], width)) not in found:
+                    found[key] = time_searches(*key)
+                row["ranks"] = json.dumps({**about, "ms_by_search": found[key]})
         write_rows(path, rows)
+
+
+def time_searches(task, width):
+    """Milliseconds (2, 4): of a model for each joint and of one model, this wide, by `searches`."""
+    calls = []
+    for sizes in sizes_of(task), sizes_of(task, 1, width):
+        model = fac.WorldModel.create(sizes, np.random.default_rng(0))
+        obs = np.zeros(sizes.dim_obs, fac.F32)
+        calls += [functools.partial(fac.Planner(model, planning).act, obs)
+                  for planning in searches()]
+    seconds = fac.interleaved_seconds(calls, 20, f"{task}, timing")
+    return (1e3 * np.median(seconds, 0)).reshape(2, -1).tolist()
 
 
 def searches():
@@ -325,32 +322,37 @@ def played_by_search(row):
     return np.array([of["returns"] for of in played if of["taught"] == taught])
 
 
-def capacity_table(lines):
-    """What one model for all joints wins and costs beside a model for each; what searching wins
-    over the priors is of the episodes by which a student chose. lines: {(task, model): rows}."""
+def capacity_table(tasks):
+    """One model for all joints beside a model for each, taught alike: what searching wins over the
+    priors is of the episodes by which a student chose. tasks: {task: {"default" or one of
+    ONE_MODEL: rows}}. Markdown, and panels of return against milliseconds, of the priors and of the
+    two narrow searches."""
     found, panels = [], {}
-    for (task, model), rows in lines.items():
-        first = [row for row in rows if int(row["evaluation_seed"]) == EVALUATION_SEEDS[0]]
-        about, settings = json.loads(first[0]["ranks"]), json.loads(first[0]["settings"])
-        sizes = sizes_of(task, settings["num_agents"], settings.get("mlp_dim"))
-        by_search = np.stack([*map(played_by_search, first)], 1)  # (4, students, episodes)
-        over_expert = {seed: [row for row in rows if int(row["evaluation_seed"]) == seed]
+    for task, models in tasks.items():
+        for case, rows in models.items():
+            by_seed = {seed: [row for row in rows if int(row["evaluation_seed"]) == seed]
                        for seed in EVALUATION_SEEDS}
-        _, error = difference(over_expert, over="expert_returns")
-        expert, student = (overall(rows, key) for key in ("expert_returns", "returns"))
-        found.append([
-            task, model, sizes.mlp_dim, f"{weights(sizes) / 1e3:.0f}k", len(first),
-            f"{expert:.0f}", f"{student:.0f} ± {error:.0f}", f"{by_search[0].mean():.0f}",
-            *("{:+.0f} ± {:.0f}".format(*mean_and_error(of - by_search[0]))
-              for of in by_search[1:]),
-            " / ".join(f"{measured(first, lambda x, h=h: x['rank_correlation_returns'][h]):.2f}"
-                       for h in (0, -1)),
-            " / ".join(f"{ms:.2f}" for ms in about["ms_by_search"][:3]),
-            f"{np.mean([float(row['minutes']) for row in first]):.0f}"])
-        panels.setdefault(task, ({}, None))[0][model] = {
-            ms: of.mean(1).tolist() for ms, of in zip(about["ms_by_search"][:3], by_search)}
+            first = by_seed[EVALUATION_SEEDS[0]]
+            _, error = difference(by_seed, over="expert_returns")
+            settings = json.loads(first[0]["settings"])
+            one, *_ = (own for name, own in models.items() if name != "default")
+            timed = json.loads((one if case == "default" else first)[0]["ranks"])["ms_by_search"]
+            ms = timed[case != "default"][:3]
+            sizes = sizes_of(task, settings["num_agents"], settings.get("mlp_dim"))
+            played = np.stack([*map(played_by_search, first)], 1)  # (4, students, episodes)
+            expert, student = (overall(rows, key) for key in ("expert_returns", "returns"))
+            name = f"{sizes.num_agents} models" if case == "default" else case
+            found.append([
+                task, name, sizes.mlp_dim, f"{weights(sizes) / 1e3:.0f}k", len(first),
+                f"{expert:.0f}", f"{student:.0f} ± {error:.0f}", f"{played[0].mean():.0f}",
+                *("{:+.0f} ± {:.0f}".format(*mean_and_error(of - played[0])) for of in played[1:]),
+                " / ".join(f"{measured(first, lambda x, h=h: x['rank_correlation_returns'][h]):.2f}"
+                           for h in (0, -1)), " / ".join(f"{x:.2f}" for x in ms),
+                f"{min(float(row['minutes']) for row in first):.1f}"])
+            panels.setdefault(task, ({}, None))[0][name] = {
+                x: of.mean(1).tolist() for x, of in zip(ms, played)}
     searched = ["{samples} x {iterations}, {max_std} - priors".format_map(vars(of))
                 for of in searches()[1:]]
     return markdown(["task", "models", "width", "weights", "students", "expert", "student",
                      "priors", *searched, "rank of G, H = 0 / last", "ms: priors / 16 x 2 / 32 x 3",
-                     "minutes"], found), panels
+                     "minutes, least"], found), panels

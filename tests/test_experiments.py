@@ -1164,8 +1164,7 @@ def test_what_each_joint_wins_alone_is_told_in_two_tables(tmp_path):
 
 def test_one_model_for_all_joints_has_as_many_weights_as_a_model_for_each():
     for task, width in (("walker-run", 241), ("humanoid-walk", 300)):
-        assert students.MODELS["one model, equal weights"](task) == {"num_agents": 1,
-                                                                     "mlp_dim": width}
+        assert students.equal_width(task) == width
         each, one = students.sizes_of(task), students.sizes_of(task, 1, width)
         assert abs(students.weights(one) / students.weights(each) - 1) < 0.005
         assert each.num_agents == each.dim_action and one.num_agents == 1
@@ -1173,6 +1172,19 @@ def test_one_model_for_all_joints_has_as_many_weights_as_a_model_for_each():
     assert students.weights(student.config) == sum(
         value.size for key, value in student.params.items()
         if "encoder" not in key and key.endswith("weight"))
+
+
+def test_one_model_is_distilled_like_a_student(monkeypatch):
+    made = []
+    monkeypatch.setattr(experiments, "run_all", lambda args, _, runs: (made.extend(runs), {
+        "out": "x.csv"})[1])
+    monkeypatch.setattr(students, "time_models", lambda path: None)
+    assert experiments.main(["capacity", "--tasks", "walker-run", "--seeds", "4"]) == 0
+    about = [json.loads(run["settings"]) for run in made]
+    assert [(run["case"], of["num_agents"], of["mlp_dim"]) for run, of in zip(made, about)] == [
+        ("one model, equal weights", 1, 241), ("one model, 512 wide", 1, 512)]
+    assert str(students.folder("runs", "walker-run", 4, made[0]["case"])) == (
+        "runs/walker-run-4-one-model-equal-weights")
 
 
 def test_capacity_is_timed_once_and_told_in_a_table(tmp_path, monkeypatch):
@@ -1189,9 +1201,11 @@ def test_capacity_is_timed_once_and_told_in_a_table(tmp_path, monkeypatch):
                      "played": played, "rank_correlation_returns": [0.9, 0.7, 0.5]}}
                 for seed in (102, 101)]
 
+    write_rows(tmp_path / "alone.csv", [
+        ("walker-run", 0, "default", {"num_agents": 6}, rows([10.0, 30.0], [30.0, 70.0])),
+        ("walker-run", 1, "default", {"num_agents": 6}, rows([20.0, 20.0], [40.0, 80.0])),
+        ("cheetah-run", 1, "default", {"num_agents": 6}, rows([20.0, 20.0], [40.0, 80.0]))])
     write_rows(path := tmp_path / "capacity.csv", [
-        ("walker-run", 0, students.FACTORED, {"num_agents": 6}, rows([10.0, 30.0], [30.0, 70.0])),
-        ("walker-run", 1, students.FACTORED, {"num_agents": 6}, rows([20.0, 20.0], [40.0, 80.0])),
         ("walker-run", 0, "one model, equal weights", {"num_agents": 1, "mlp_dim": 241},
          rows([50.0, 50.0], [49.0, 49.0]))])
     timed = []
@@ -1203,18 +1217,18 @@ def test_capacity_is_timed_once_and_told_in_a_table(tmp_path, monkeypatch):
     monkeypatch.setattr(fac, "interleaved_seconds", seconds)
     for _ in range(2):
         students.time_models(path)
-    assert [len(calls) for calls in timed] == [8, 0][:len(timed)]  # two models, four searches
+    assert [len(calls) for calls in timed] == [8]  # two models, four searches
     result, text = experiments.report_capacity("capacity", path, tmp_path)
     each, one = ([cell.strip() for cell in line.split("|")[1:-1]] for line in
                  text.splitlines()[2:])
     # narrow - priors: 20, 40 and 20, 60: students' means 30 and 40, an error of 5; episodes' 20 and
     # 50, one of 15
-    assert each == ["walker-run", students.FACTORED, "85", "376k", "2", "160", "150 ± 17", "20",
-                    "+0 ± 0", "+35 ± 16", "+0 ± 0", "0.90 / 0.50", "1.00 / 2.00 / 3.00", "6"]
+    assert each == ["walker-run", "6 models", "85", "376k", "2", "160", "150 ± 17", "20",
+                    "+0 ± 0", "+35 ± 16", "+0 ± 0", "0.90 / 0.50", "1.00 / 2.00 / 3.00", "6.0"]
     assert one[1:4] == ["one model, equal weights", "241", "375k"]
     assert one[7:11] == ["50", "+0 ± 0", "-1 ± 0", "+0 ± 0"]
     assert one[12] == "5.00 / 6.00 / 7.00"
-    assert result == {"runs": 2} and (tmp_path / "capacity.png").exists()
+    assert result == {"tasks": ["walker-run"]} and (tmp_path / "capacity.png").exists()
 
 
 def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkeypatch):
