@@ -42,13 +42,14 @@ def main():
             arrow(45.5, 24, 45.5, 20)
     ax.text(45.5, 8, "...", ha="center", va="center")
     ax.text(66, 8, "...", ha="center", va="center")
-    box(83, 10, 7, "sum", PLAIN, 4)
+    box(83, 9, 10, "sum, or here\njoint by joint\n[D9]", PLAIN, 6)
     box(94, 20, 15, "the same order\nof K actions?\n(Equation 4)", PLAIN, 8)
     arrow(77, 36, 101.5, 28)
-    arrow(90, 12, 101.5, 20)
+    arrow(93, 12, 101.5, 20)
     ax.text(1, 12, "To plan, each joint searches its own\naction sequences with its own small\n"
             "model (Equations 2 and 3): since\nrewards and values are sums, the best\n"
-            "plan is the best of each.", va="center", fontsize=9)
+            "plan is the best of each. Its prior,\ntaught what the expert's policy does,\n"
+            "acts without a search, or begins one.", va="center", fontsize=9)
     ax.set_title("An expert's world model is distilled into one small model for each joint",
                  fontsize=11)
     plots.save_figure(fac.DATA / "figures" / "method.png", figure)
