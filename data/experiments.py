@@ -644,15 +644,16 @@ def report_alone(_, path, figures):
 
 
 def report_capacity(_, path, figures):
-    """One model for all joints beside alone.csv's model for each; the figure: return against
-    milliseconds, of the priors and of two searches around them, in the episodes of the choice."""
+    """One model for all joints beside alone.csv's model for each; the figure: what the narrow
+    searches win against milliseconds, in the episodes of the choice."""
     tasks = {task: {"default": []} for task, *_ in settled(path)}
     for (task, _, case, _), rows in [*settled(path.with_name("alone.csv")).items(),
                                      *settled(path).items()]:
         if task in tasks:
             tasks[task].setdefault(case, []).extend(rows)
     text, panels = students.capacity_table(tasks)
-    draw_lines(figures / "capacity.png", panels, "milliseconds of a decision")
+    draw_lines(figures / "capacity.png", panels, "milliseconds of a decision",
+               "return - the priors' alone")
     return {"tasks": [*tasks]}, text
 
 

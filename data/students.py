@@ -325,8 +325,8 @@ def played_by_search(row):
 def capacity_table(tasks):
     """One model for all joints beside a model for each, taught alike: what searching wins over the
     priors is of the episodes by which a student chose. tasks: {task: {"default" or one of
-    ONE_MODEL: rows}}. Markdown, and panels of return against milliseconds, of the priors and of the
-    two narrow searches."""
+    ONE_MODEL: rows}}. Markdown, and panels of what the two narrow searches win against
+    milliseconds."""
     found, panels = [], {}
     for task, models in tasks.items():
         for case, rows in models.items():
@@ -349,8 +349,9 @@ def capacity_table(tasks):
                 " / ".join(f"{measured(first, lambda x, h=h: x['rank_correlation_returns'][h]):.2f}"
                            for h in (0, -1)), " / ".join(f"{x:.2f}" for x in ms),
                 f"{min(float(row['minutes']) for row in first):.1f}"])
-            panels.setdefault(task, ({}, None))[0][name] = {
-                x: of.mean(1).tolist() for x, of in zip(ms, played)}
+            label = "a model for each joint" if case == "default" else case
+            panels.setdefault(task, ({}, None))[0][label] = {
+                x: (of - played[0]).mean(1).tolist() for x, of in zip(ms, played)}
     searched = ["{samples} x {iterations}, {max_std} - priors".format_map(vars(of))
                 for of in searches()[1:]]
     return markdown(["task", "models", "width", "weights", "students", "expert", "student",

@@ -48,7 +48,7 @@ def cell(found):
     return f"{found['mean']:.0f}{spread}{rank}{ms}"
 
 
-def draw_lines(path, panels, xlabel, **axes):
+def draw_lines(path, panels, xlabel, ylabel="episode return", **axes):
     """A panel each {title: ({label: {x: [values]}}, level or None)}: mean and band (± sample
     deviation) over seeds; the level, an expert's, is a line across."""
     plt = plots.pyplot()
@@ -73,7 +73,7 @@ def draw_lines(path, panels, xlabel, **axes):
         if level is not None:
             ax.axhline(level, color="black", linewidth=0.8, linestyle=(0, (1, 3)), label="expert")
         low = min([0, *(np.mean(y) for points in lines.values() for y in points.values())])
-        ax.set(title=title, xlabel=xlabel, ylabel="episode return",
+        ax.set(title=title, xlabel=xlabel, ylabel=ylabel,
                ylim=(1.05 * low, 1.05 * max(0, ax.get_ylim()[1])), **axes)
         if axes:  # logarithmic: a tick for each point
             ax.set_xticks(x := sorted(set().union(*lines.values())), [f"{v:.0f}" for v in x])
