@@ -2248,7 +2248,7 @@ def command_distill(args):
         **preset_values(DistillConfig, named), **({"reuse": 1} if args.plain else {})})
     expert, header, replay, path = load_data(args)
     theirs = {**preset_values(PlannerConfig, named), **made_for(header, path)}
-    Planner(expert, own := PlannerConfig(**theirs))  # what it lacks is missed now
+    own = PlannerConfig(**theirs)  # the expert's
     search = student_planning(config) if getattr(args, "PlannerConfig.prior") != "last" else {}
     planning = from_args(PlannerConfig, args, **{
         **theirs, **(search and {"elites": 0, "min_std": PlannerConfig.min_std}), **search,

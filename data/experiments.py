@@ -5,10 +5,10 @@
     python data/experiments.py figure4 --tasks walker-run --seeds 0 1 2
     python data/experiments.py report
 
-Figures 4, 5, 7, 8, 12, 13, departures, `students` and `sweep` are lists of runs (runs.py), whose
-rows go to one CSV each under data/results. `report` draws all but sweeps, from CSVs and the
-experts' records. Table 3 is in speed.py, section 5.6 in look.py, what is distilled in other ways
-in baselines.py, statistics and drawing in tables.py.
+Figures 4, 5, 7, 8, 12, 13, departures, `students`, `capacity` and `sweep` are lists of runs
+(runs.py), whose rows go to one CSV each under data/results. `report` draws all but sweeps, from
+CSVs and the experts' records. Table 3 is in speed.py, section 5.6 in look.py, what is distilled in
+other ways in baselines.py, statistics and drawing in tables.py.
 """
 import contextlib
 import csv

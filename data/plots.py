@@ -1,4 +1,5 @@
 """This project's figures: one style, written whole, and no run lost where one can't be drawn."""
+import io
 import os
 import sys
 from pathlib import Path
@@ -30,9 +31,11 @@ def pyplot_for(path):
 
 
 def save_figure(path, figure):
-    """Write a figure as PNG and forget it."""
+    """Write a figure as PNG, in 64 colours (a third as large), and forget it."""
+    from PIL import Image  # which matplotlib needs
+    figure.savefig(picture := io.BytesIO(), dpi=110, format="png")
     with fac.atomic_file(path) as file:
-        figure.savefig(file, dpi=110, format="png")
+        Image.open(picture).convert("RGB").quantize(64).save(file, "png", optimize=True)
     pyplot().close(figure)
 
 

@@ -1015,7 +1015,7 @@ def test_expert_and_student_plan_over_the_horizon_they_were_made_for(tmp_path, f
     assert fac.main([str(a) for a in arguments]) == 0
     out = capsys.readouterr().out
     assert "horizon 3 and 2" in out
-    assert timed[:3] == [3, 2, 3]  # both as a check; then timed
+    assert timed[:2] == [2, 3]
     evaluation = ["evaluate", "--model", str(tmp_path / "student.npz")]
     assert fac.main(evaluation) == fac.main([*evaluation, "--horizon", "0"]) == 0
     assert seen == [3, 3, 2, 2, 2, 0]  # expert, student, each in more ways; evaluate twice
