@@ -6,6 +6,7 @@ latent. Algorithm 1 perturbs latent actions, and the targets are the expert's fo
 to; MPPI plans latent actions, of which the robot gets the first, decoded. The VAE learns before,
 from its own loss (reconstruction and KL to the prior), and stays as it is then.
 """
+import dataclasses
 import functools
 from collections import defaultdict
 
@@ -71,6 +72,13 @@ class LightlyConsistentDistiller(ConsistentDistiller):
     """The same with a weight that leaves most of the loss to Equation 4."""
 
     loss = staticmethod(functools.partial(consistency_loss, weight=0.03))
+
+
+def of_equal_weights(one, sizes, weights):
+    """`one`, a ModelConfig, as wide as it takes to have as many weights as `sizes`, another;
+    weights(ModelConfig): how many count."""
+    return min((dataclasses.replace(one, mlp_dim=width) for width in range(1, 1024)),
+               key=lambda one: abs(weights(one) - weights(sizes)))
 
 
 def small_distiller(expert, replay, config, _, seed):

@@ -646,15 +646,14 @@ def report_alone(_, path, figures):
 def report_capacity(_, path, figures):
     """One model for all joints beside alone.csv's model for each; the figure: what the narrow
     searches win against milliseconds, in the episodes of the choice."""
-    tasks = {task: {"default": []} for task, *_ in settled(path)}
-    for (task, _, case, _), rows in [*settled(path.with_name("alone.csv")).items(),
-                                     *settled(path).items()]:
-        if task in tasks:
-            tasks[task].setdefault(case, []).extend(rows)
-    text, panels = students.capacity_table(tasks)
+    own, each = settled(path), settled(path.with_name("alone.csv"))
+    tasks = list(dict.fromkeys(task for task, *_ in own))
+    text, panels = students.capacity_table(students.by_line([
+        row for task in tasks for runs in (each, own) for key, rows in runs.items()
+        if key[0] == task for row in rows]))
     draw_lines(figures / "capacity.png", panels, "milliseconds of a decision",
                "return - the priors' alone")
-    return {"tasks": [*tasks]}, text
+    return {"tasks": tasks}, text
 
 
 REPORT_HEAD = """# The paper's figures, here

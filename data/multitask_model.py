@@ -13,6 +13,7 @@ import functools
 import numpy as np
 
 import fac_tdmpc_ref as fac
+from baselines import of_equal_weights
 
 # ------------------------------------------------------------------------------- the student
 
@@ -98,10 +99,8 @@ def student_sizes(dims, centralized):
                                "observation")
     if not centralized:
         return sizes
-    of_width = functools.partial(dataclasses.replace, sizes, num_agents=1,
-                                 latent_dim=dim_action * sizes.latent_dim)
-    return min((of_width(mlp_dim=width) for width in range(1, 1024)),
-               key=lambda one: abs(weights(one) - weights(sizes)))
+    one = dataclasses.replace(sizes, num_agents=1, latent_dim=dim_action * sizes.latent_dim)
+    return of_equal_weights(one, sizes, weights)
 
 
 def save(path, student, header):

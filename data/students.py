@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import fac_tdmpc_ref as fac
+from baselines import of_equal_weights
 from runs import lock, read_rows, write_rows
 from speed import useful_workers
 from tables import deviation, markdown, of_returns
@@ -24,7 +25,6 @@ HEADS = ("seeds", "MPPI", "student", KEPT, "least kept", WINS,
          "rank correlation of G, H = 0 / last", "minutes")
 FLAGS = {"samples": "plan-samples", "iterations": "plan-iterations", "num_agents": "num-agents",
          "mlp_dim": "mlp-dim"}
-PRESETS = "default", "plain", "paper"
 
 
 def folder(students, task, seed, case):
@@ -50,9 +50,7 @@ def weights(sizes):
 def equal_width(task):
     """The hidden width with which one model for all joints has as many weights as a model for each
     have together."""
-    goal, one = weights(sizes_of(task)), sizes_of(task, 1)
-    return min(range(1, 1024), key=lambda width: abs(goal - weights(
-        dataclasses.replace(one, mlp_dim=width))))
+    return of_equal_weights(sizes_of(task, 1), sizes_of(task), weights).mlp_dim
 
 
 ONE_MODEL = {"one model, equal weights": equal_width, "one model, 512 wide": lambda task: 512}
@@ -110,7 +108,7 @@ def distil_student(task, seed, case, settings, students):
     seed. case: a preset, or one of ONE_MODEL; settings: of FLAGS, `steps` and `episodes`."""
     flags = [f"--{FLAGS.get(name, name)}={value}" for name, value in settings.items()]
     out = default = folder(students, task, seed, case)
-    preset = case if case in PRESETS else "default"
+    preset = "default" if case in ONE_MODEL else case
     if budget := [f"{k}-{settings[k]}" for k in ("samples", "iterations") if k in settings]:
         out = default.with_name("-".join([default.name, *budget]))  # whose search is another
         if default.exists() and not out.exists():
@@ -322,36 +320,34 @@ def played_by_search(row):
     return np.array([of["returns"] for of in played if of["taught"] == taught])
 
 
-def capacity_table(tasks):
+def capacity_table(lines):
     """One model for all joints beside a model for each, taught alike: what searching wins over the
-    priors is of the episodes by which a student chose. tasks: {task: {"default" or one of
-    ONE_MODEL: rows}}. Markdown, and panels of what the two narrow searches win against
+    priors is of the episodes by which a student chose. lines: `by_line`'s, of every task some that
+    `time_models` timed. Markdown, and panels of what the two narrow searches win against
     milliseconds."""
-    found, panels = [], {}
-    for task, models in tasks.items():
-        for case, rows in models.items():
-            by_seed = {seed: [row for row in rows if int(row["evaluation_seed"]) == seed]
-                       for seed in EVALUATION_SEEDS}
-            first = by_seed[EVALUATION_SEEDS[0]]
-            _, error = difference(by_seed, over="expert_returns")
-            settings = json.loads(first[0]["settings"])
-            one, *_ = (own for name, own in models.items() if name != "default")
-            timed = json.loads((one if case == "default" else first)[0]["ranks"])["ms_by_search"]
-            ms = timed[case != "default"][:3]
-            sizes = sizes_of(task, settings["num_agents"], settings.get("mlp_dim"))
-            played = np.stack([*map(played_by_search, first)], 1)  # (4, students, episodes)
-            expert, student = (overall(rows, key) for key in ("expert_returns", "returns"))
-            name = f"{sizes.num_agents} models" if case == "default" else case
-            found.append([
-                task, name, sizes.mlp_dim, f"{weights(sizes) / 1e3:.0f}k", len(first),
-                f"{expert:.0f}", f"{student:.0f} ± {error:.0f}", f"{played[0].mean():.0f}",
-                *("{:+.0f} ± {:.0f}".format(*mean_and_error(of - played[0])) for of in played[1:]),
-                " / ".join(f"{measured(first, lambda x, h=h: x['rank_correlation_returns'][h]):.2f}"
-                           for h in (0, -1)), " / ".join(f"{x:.2f}" for x in ms),
-                f"{min(float(row['minutes']) for row in first):.1f}"])
-            label = "a model for each joint" if case == "default" else case
-            panels.setdefault(task, ({}, None))[0][label] = {
-                x: (of - played[0]).mean(1).tolist() for x, of in zip(ms, played)}
+    timed, found, panels = {}, [], {}
+    for row in (by_seed[min(by_seed)][0] for by_seed in lines.values()):
+        if ms := json.loads(row["ranks"]).get("ms_by_search"):
+            timed[row["task"], "default"], timed[row["task"], row["case"]] = ms
+    for by_seed in lines.values():
+        rows, first = sum(by_seed.values(), []), by_seed[min(by_seed)]
+        task, case, settings = first[0]["task"], first[0]["case"], json.loads(first[0]["settings"])
+        _, error = difference(by_seed, over="expert_returns")
+        ms = timed[task, case][:3]
+        sizes = sizes_of(task, settings["num_agents"], settings.get("mlp_dim"))
+        played = np.stack([*map(played_by_search, first)], 1)  # (4, students, episodes)
+        expert, student = (overall(rows, key) for key in ("expert_returns", "returns"))
+        name = f"{sizes.num_agents} models" if case == "default" else case
+        found.append([
+            task, name, sizes.mlp_dim, f"{weights(sizes) / 1e3:.0f}k", len(first), f"{expert:.0f}",
+            f"{student:.0f} ± {error:.0f}", f"{played[0].mean():.0f}",
+            *("{:+.0f} ± {:.0f}".format(*mean_and_error(of - played[0])) for of in played[1:]),
+            " / ".join(f"{measured(first, lambda x, h=h: x['rank_correlation_returns'][h]):.2f}"
+                       for h in (0, -1)), " / ".join(f"{x:.2f}" for x in ms),
+            f"{min(float(row['minutes']) for row in first):.1f}"])
+        label = "a model for each joint" if case == "default" else case
+        panels.setdefault(task, ({}, None))[0][label] = {
+            x: (of - played[0]).mean(1).tolist() for x, of in zip(ms, played)}
     searched = ["{samples} x {iterations}, {max_std} - priors".format_map(vars(of))
                 for of in searches()[1:]]
     return markdown(["task", "models", "width", "weights", "students", "expert", "student",
