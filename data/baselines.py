@@ -1,4 +1,5 @@
-"""What Figures 4 and 5 distil beside Fac-TDMPC: other losses, a small TD-MPC, and TAP.
+"""What Figures 4 and 5 distil beside Fac-TDMPC: other losses, a small TD-MPC, and TAP; and how the
+authors' program plans.
 
 TAP (appendix B.2) is a world model whose actions are two latent numbers. A variational autoencoder
 (VAE) maps actions to latent actions and back; as in TAP, both ways see the state, here the expert's
@@ -198,3 +199,29 @@ def distiller_of(case):
     return {"MSE": MSEDistiller, "consistency": ConsistentDistiller, "TAP": TapDistiller,
             "consistency 0.03": LightlyConsistentDistiller,
             "10% TD-MPC": small_distiller}.get(case, fac.Distiller)
+
+
+# ------------------------------------------------------------------ as the authors' program plans
+
+class AuthorsPlanner(fac.Planner):
+    """A student's planner that sees its expert's policy, as in the authors' program: `pi_trajs` of
+    its noisy rollouts, in the expert's model, compete in every iteration, and each agent chooses
+    among its own parts of them by its own networks."""
+
+    def __init__(self, student, expert, config, seed=0):
+        super().__init__(student, config, seed)
+        self.expert, self.own.proposals = expert, self.proposals
+
+    def plan(self, obs):
+        self.obs = np.array(obs, fac.F32)[:, None]
+        return super().plan(obs)
+
+    def proposals(self, _):
+        """(N, L, d, P), or None if P = 0."""
+        sizes, L, P = self.model.config, self.config.horizon + 1, self.config.pi_trajs
+        if not P:
+            return None
+        noise = fac.policy_noise((L, 1, sizes.dim_action, P), self.own.rngs[0])
+        z = np.repeat(self.expert.encode(self.obs), P, 2)
+        actions = fac.policy_rollout(self.expert, z, noise)[:, 0, fac.agent_order(sizes)]
+        return actions.reshape(L, sizes.num_agents, -1, P).swapaxes(0, 1)

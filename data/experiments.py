@@ -30,7 +30,7 @@ import look  # noqa: E402
 import plots  # noqa: E402
 import speed  # noqa: E402
 import students  # noqa: E402
-from baselines import DecodingEnvironment, distiller_of  # noqa: E402
+from baselines import AuthorsPlanner, DecodingEnvironment, distiller_of  # noqa: E402
 from runs import (  # noqa: E402
     append_rows, finished, key_of, lock, make_all, make_run, read_rows, unique, versions,
     write_rows)
@@ -269,13 +269,15 @@ def command_sweep(args):
 BUDGETS = [(s, i) for s in (512, 256, 128, 64, 32, 16) for i in (6, 4, 2, 1)]
 
 
-def load(task, seed, case, students):
-    """A task's expert (model, header), or the student that `distill` left in its folder."""
+def load(task, seed, case, folder):
+    """A task's expert (model, header), or the student, of a case or preset, in its folder."""
     if case == "expert":
         return fac.load_model(fac.data_file(task, "expert.npz"))
-    path = Path(students) / f"{task}-{seed}" / "student.npz"
+    case = "default" if case == "student" else case
+    path = students.folder(folder, task, seed, case) / "student.npz"
     fac.need(path.exists(), f"{path}: no such file; make it with 'python fac_tdmpc_ref.py distill "
-             f"--task {task} --seed {seed}', or name the folder above with --students")
+             f"--task {task} --seed {seed} --preset {case} --out {path.parent}', or name the folder"
+             " above with --students")
     return fac.load_model(path, ["student"])
 
 
@@ -385,6 +387,77 @@ def command_figure8(args):
         return [{}, *({"joint": j, "kind": kind} for j in joints for kind in KINDS)]
     return run_all(args, functools.partial(plan_with, students=args.students),
                    planning_runs(args, variants))
+
+
+# ------------------------------------------------- as the authors' program plans, and no page says
+
+WAYS = {"as printed": {"pi_trajs": 0}, "proposals": {}, "sharp scores": {"pi_trajs": 0, "sharp": 1},
+        "both": {"sharp": 1}, "both, the mean": {"sharp": 1, "output": "mean"}}
+
+
+def plan_like_authors(task, seed, case, settings, folder):
+    """Returns of a student, made by a preset, that searches from its last plan, as printed or in
+    the other ways of WAYS; its expert's policy alone beside it."""
+    expert, theirs = fac.load_model(fac.data_file(task, "expert.npz"))
+    preset, way = case.split(": ")
+    student, header = load(task, seed, preset, folder)
+    own = {key: value for key, value in fac.made_for(header, "student").items()
+           if key in ("horizon", "discount", "action_repeat")}
+    sharp, way = WAYS[way].get("sharp"), {k: v for k, v in WAYS[way].items() if k != "sharp"}
+    if sharp:  # N G_i, since heads are summed over agents here, and averaged there
+        way["inverse_temperature"] = 0.5 * student.config.num_agents
+    planning = fac.PlannerConfig(**own, **way)
+    reflex = fac.PlannerConfig(**{**fac.made_for(theirs, "expert"), "prior": "own",
+                                  "iterations": 0})
+    for evaluation_seed in students.EVALUATION_SEEDS:
+        found = fac.evaluate(expert, task, reflex, settings["episodes"], evaluation_seed, 0)
+        with AuthorsPlanner(student, expert, planning) as planner:
+            played = returns_by(planner, task, settings["episodes"], evaluation_seed)
+        yield {**of_returns(played, evaluation_seed),
+               "policy_returns": np.round(found["returns"], 3).tolist()}
+
+
+def returns_by(planner, task, episodes, evaluation_seed):
+    """Episodes' returns where a planner acts, as by `fac.evaluate`."""
+    found = []
+    with contextlib.closing(fac.make_robot(task, planner.config.action_repeat)) as robot:
+        for seed in fac.episode_seeds(evaluation_seed, episodes):
+            planner.reset(seed)
+            obs, rewards = robot.reset(seed), []
+            for _ in range(robot.episode_steps):
+                obs, reward = robot.step(planner.act(obs))
+                rewards.append(reward)
+            found.append(sum(rewards))
+    return found
+
+
+def command_authors(args):
+    """authors: students that plan as the authors' program does, and the paper doesn't say."""
+    runs = [make_run(task, seed, f"{preset}: {way}", episodes=args.episodes,
+                     **identity(*load(task, seed, preset, args.students)))
+            for task, seed, preset, way in itertools.product(
+                args.tasks, args.seeds, args.presets, args.ways)]
+    return run_all(args, functools.partial(plan_like_authors, folder=args.students), runs)
+
+
+def report_authors(_, path, figures):
+    """As the authors' program plans: mean returns, ± `students.difference`'s error of that from
+    the policy's in the same episodes."""
+    lines, table = defaultdict(lambda: defaultdict(list)), []
+    for (task, _, case, _), own in settled(path, whole=False).items():
+        preset, way = case.split(": ")
+        for row in own:
+            lines[task, preset].setdefault(way, {}).setdefault(
+                row["evaluation_seed"], []).append(row)
+    for line, ways in lines.items():
+        rows = {way: sum(found.values(), []) for way, found in ways.items()}
+        first = next(iter(rows.values()))
+        cells = {way: f"{students.overall(own, 'returns'):.0f} ± "
+                 f"{students.difference(ways[way])[1]:.0f}" for way, own in rows.items()}
+        table.append((", ".join(line), len({row["seed"] for row in first}),
+                      f"{students.overall(first, 'policy_returns'):.0f}",
+                      *(cells.get(way, "-") for way in WAYS)))
+    return table, markdown(["", "students", "policy alone", *WAYS], table)
 
 
 # ---------------------------------------------------------- Figure 12: distilling on the way
@@ -671,6 +744,7 @@ agents have 26%. One agent's layers are as wide as its expert's, N agents' an Nt
 
 """
 REPORTS = {"alone": report_alone, "students": report_students, "capacity": report_capacity,
+           "authors": report_authors,
            "figure4": report_curves, "figure5": report_curves, "figure7": report_figure7,
            "figure8": report_figure8, "figure12": report_curves, "figure13": report_curves,
            "departures": report_curves}
@@ -688,7 +762,7 @@ def command_report(args):
             except (LookupError, ValueError, TypeError, StopIteration) as odd:
                 raise fac.UserError(f"{results / name}.csv: not {name}'s rows ({odd!r})") from None
             title = name.replace("figure", "Figure ").capitalize()
-            drawn = name not in ("alone", "students")
+            drawn = name not in ("alone", "students", "authors")
             picture = f"![]({figures_from}/{name}.png)\n" if drawn else ""
             text.append(f"## {title}\n\n{table}\n{picture}")
     fac.need(result, f"{results}: no runs there; make some, e.g. with 'experiments.py figure4'")
@@ -773,6 +847,16 @@ def make_parser():
                      choices=[*students.ONE_MODEL],
                      help=f"any of: {'; '.join(students.ONE_MODEL)} [all]")
     sub.add_argument("--students", default="runs", help="leave them in TASK-SEED-CASE/ [runs]")
+    sub = add_runs("authors", command_authors, "Students that search as the paper prints it, from "
+                   "their last plan, and as the authors' program does: the expert's noisy rollouts "
+                   "among each agent's candidates, scores by exp(0.5 N G).",
+                   ["walker-run", "quadruped-walk"], episodes=5)
+    sub.add_argument("--ways", nargs="+", default=[*WAYS], choices=[*WAYS], metavar="WAY",
+                     help=f"any of: {'; '.join(WAYS)} [all]")
+    sub.add_argument("--presets", nargs="+", default=["default", "plain"], metavar="PRESET",
+                     choices=("default", "plain", "paper"), help="students' [default plain]")
+    sub.add_argument("--students", default="runs", help="where distill left TASK-SEED/ and, of "
+                     "another preset, TASK-SEED-PRESET/ [runs]")
     sub = add_runs("figure12", command_figure12, "Appendix C.1: an expert that learns and a "
                    "student that follows it.", ["reacher-easy", "walker-walk", "cheetah-run"],
                    episodes=10)

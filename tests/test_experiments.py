@@ -140,7 +140,7 @@ def test_help_teaches():
     (commands,) = (a.choices for a in parser._actions if isinstance(a.choices, dict))
     assert set(commands) == {"table3", "figure4", "figure5", "figure6", "figure7", "figure8",
                              "figure9", "figure12", "figure13", "departures", "sweep", "students",
-                             "capacity", "agreement", "watch", "report"}
+                             "capacity", "authors", "agreement", "watch", "report"}
     assert commands.pop("figure6") is commands["table3"]
     assert all(name in parser.format_help() for name in commands)
     for name, command in commands.items():
@@ -1541,3 +1541,80 @@ def test_figure9_and_agreement_draw_a_model(tmp_path, monkeypatch):
                                                        "data": [1, 2, "reacher-hard"]})
     refused(here("agreement", "--model", "student.npz", "--expert", "expert.npz", cwd=tmp_path),
             "another expert", "--expert")
+
+
+# as the authors' program plans ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("agents, groups", [(3, ""), (3, "2/0/1"), (1, "")])
+def test_agents_choose_among_their_own_parts_of_the_expert_s_rollouts(agents, groups):
+    """With one sample and 24 proposals, most elites are parts of what the expert's policy does."""
+    expert = random_model(1, policy=True, seed=1)
+    student = random_model(agents)
+    student.config = dataclasses.replace(student.config, groups=groups)
+    config = fac.PlannerConfig(8, 1, pi_trajs=4, horizon=2)
+    obs = np.linspace(-1, 1, 8, dtype=fac.F32)
+    with baselines.AuthorsPlanner(student, expert, config, seed=3) as planner:
+        planner.plan(obs)  # tells it the observation
+        planner.reset(5)
+        found = planner.proposals(None)
+        assert found.shape == (agents, 3, 3 // agents, 4)
+        rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(5).spawn(agents)[0]))
+        noise = fac.policy_noise((3, 1, 3, 4), rng)
+        z = np.repeat(expert.encode(obs[:, None]), 4, 2)
+        rolled = fac.policy_rollout(expert, z, noise)[:, 0]  # (L, A, P)
+        order = [2, 0, 1] if groups else [0, 1, 2]
+        for i, joint in enumerate(order):
+            assert (found[i * agents // 3, :, i % (3 // agents)] == rolled[:, joint]).all()
+
+
+def test_a_student_without_proposals_plans_as_printed():
+    expert, student = random_model(1, policy=True, seed=1), random_model()
+    config, obs = fac.PlannerConfig(8, 2, pi_trajs=0), np.ones(8)
+    with baselines.AuthorsPlanner(student, expert, config) as planner:
+        assert (planner.act(obs) == fac.Planner(student, config).act(obs)).all()
+    seen = dataclasses.replace(config, pi_trajs=24)
+    with baselines.AuthorsPlanner(student, expert, seen) as planner:
+        assert (planner.act(obs) != fac.Planner(student, seen).act(obs)).any()
+
+
+def test_every_way_of_the_authors_program_is_played(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made, played = [], []
+    for name, preset in (("reacher-hard-0", "default"), ("reacher-hard-0-plain", "plain")):
+        config = fac.DistillConfig(**fac.preset_values(fac.DistillConfig, preset))
+        fac.save_model(f"runs/{name}/student.npz", random_model(), {
+            "kind": "student", "distill": vars(config), "planner": {"max_std": 0.15}})
+    planner = baselines.AuthorsPlanner
+
+    def spy(student, expert, config):
+        made.append(config)
+        return planner(student, expert, dataclasses.replace(config, samples=8, iterations=1))
+
+    monkeypatch.setattr(experiments, "AuthorsPlanner", spy)
+    monkeypatch.setattr(experiments, "returns_by", lambda planner, task, episodes, seed: (
+        played.append((episodes, seed)) or [len(played), 1.0]))
+    monkeypatch.setattr(fac, "evaluate", lambda model, task, config, episodes, *_: {
+        "returns": [0.5] * episodes})
+    seen = []
+    monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: seen.extend(runs))
+    assert experiments.main(["authors", "--tasks", "reacher-hard", "--seeds", "0", "--episodes",
+                             "2", "--students", "runs"]) == 0
+    play = functools.partial(experiments.plan_like_authors, folder="runs")
+    experiments.append_rows(path := tmp_path / "authors.csv", [
+        row for one in seen for row in runs.attempt(play, one)])
+    assert played == [(2, 101), (2, 102)] * 10
+    assert {(c.pi_trajs, c.inverse_temperature, c.output) for c in made} == {
+        (0, 0.5, "sampled"), (24, 0.5, "sampled"), (0, 1.5, "sampled"), (24, 1.5, "sampled"),
+        (24, 1.5, "mean")}
+    assert {(c.max_std, c.prior, c.samples, c.iterations) for c in made} == {(2.0, "last", 128, 4)}
+    _, text = experiments.report_authors("authors", path, None)
+    assert "| reacher-hard, plain | 1 | 0 |" in text and text.count("±") == 10
+
+
+def test_a_planner_s_returns_are_evaluate_s():
+    expert, header = fac.load_model(fac.EXPERTS / "pendulum-swingup" / "expert.npz")
+    config = fac.PlannerConfig(**{**fac.made_for(header, "expert"), "samples": 4, "iterations": 1})
+    with fac.Planner(expert, config) as planner:
+        found = experiments.returns_by(planner, header["task"], 2, 101)
+    assert found == fac.evaluate(expert, header["task"], config, 2, 101, 0)["returns"]
