@@ -2420,6 +2420,9 @@ def command_evaluate(args):
     model, header = load_model(args.model)
     task = args.task or header.get("task")
     planning = planning_of({**header, "task": task}, args.model, args)
+    flags = {name for name in SEARCH if getattr(args, f"PlannerConfig.{name}") is not None}
+    need(planning.iterations or flags <= {"prior", "iterations"}, f"{args.model}: acts by its "
+         "priors, without a search; flags of one need --iterations (such as 3), too")
     need(task, f"{args.model}: header: no task; pass --task")
     need(task == header.get("task") or not args.record, f"{args.model}: header: task: expected "
          f"{task!r} to record its returns, found {header.get('task')!r}")

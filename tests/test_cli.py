@@ -427,6 +427,19 @@ def test_evaluate_plans_a_student_as_it_was_chosen(quick, tmp_path, monkeypatch)
                     fac.PlannerConfig(horizon=1)]
 
 
+def test_flags_of_a_search_need_one(quick, tmp_path, monkeypatch, capsys):
+    """A student that acts by its priors would leave them unused, without a word."""
+    quick(chosen=0)
+    model = ["evaluate", "--model", str(tmp_path / "out" / "student.npz"), "--episodes", "1"]
+    monkeypatch.setattr(fac, "evaluate", lambda model, task, planning, *_: {
+        "returns": [planning.samples * planning.iterations], "plan_ms_median": 0.0})
+    assert fac.main([*model, "--samples", "7"]) == 2
+    assert "without a search; flags of one need --iterations" in capsys.readouterr().err
+    assert fac.main([*model, "--samples", "7", "--iterations", "2", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["returns"] == [14]
+    assert fac.main([*model, "--iterations", "0"]) == 0
+
+
 def test_part_one_alone_distils_and_goes_on_from_its_end(tmp_path, files, short_episodes):
     """--plain: the loop and the planner that Part I reads; given again it is evaluated alone."""
     arguments = distill_arguments(files, "--plain", "--workers", "0", "--json")
