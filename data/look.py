@@ -11,6 +11,7 @@ import numpy as np
 
 import fac_tdmpc_ref as fac
 import plots
+from tables import record
 
 PIXELS, BARS, TEXT = 240, 70, 34  # a picture's side, width of the bars beside, height of the text
 RENDERERS = "from dm_control import suite; suite.load('reacher', 'easy').physics.render(8, 8)"
@@ -279,6 +280,7 @@ def command_figure9(args):
               "moments": moments, "seconds": round(time.monotonic() - began, 1)}
     if apart is not None:
         print(f"silhouette by agent {apart:.2f}, shuffled {shuffled:.2f}, untrained {first:.2f}")
+        keep(args, header, {"silhouette": apart, "shuffled": shuffled, "untrained": first})
     print(args.out)
     return result
 
@@ -371,8 +373,21 @@ def command_agreement(args):
         for name, key in (("held-out states", "held_out"), ("worst episode", "worst_episode")))])
     print(f"a sum over action dimensions, fitted, ranks the expert's G at "
           f"{', '.join(f'{x:.2f}' for x in ceiling)} (H = 0, 1, ...; noise of {NOISE})")
+    keep(args, header, {
+        **{f"joint {j}, {name}": x for name, key in (("held-out states", "held_out"), (
+            "worst episode", "worst_episode")) for j, x in enumerate(result[key])},
+        **{f"best sum, H = {H}": x for H, x in enumerate(ceiling)},
+        **{f"best sum's share of the variance, H = {H}": x for H, x in enumerate(explained)}})
     print(args.out)
     return result
+
+
+def keep(args, header, found):
+    """Numbers about a student into the CSV that --record names, if it does."""
+    if args.record:
+        record(args.record, ("task", "seed", "what", "number"), [
+            (args.task or header["task"], header.get("seed", ""), what, number)
+            for what, number in found.items()])
 
 
 def open_model(args, **kinds):
@@ -413,6 +428,8 @@ def add_commands(commands):
         sub.add_argument("--seed", type=fac.natural, default=0, help="of the episodes [0]")
         sub.add_argument("--episodes", type=positive, default=episodes, help="[%(default)s]")
         sub.add_argument("--out", default=f"{name}.png", help="the picture [%(default)s]")
+        sub.add_argument("--record", metavar="CSV", help="keep the numbers there, by task and "
+                         "distillation seed, in place of earlier ones [none is kept]")
     sub.add_argument("--expert", help="the expert's file or folder [data/experts/TASK]")
     sub.add_argument("--replay", help="[replay.npz beside the expert]")
     sub.add_argument("--states", type=positive, default=256, help="held-out ones [%(default)s]")

@@ -3,7 +3,6 @@
 `experiments.py table3` runs it, or `figure6`. Speed doesn't depend on what a model has learned.
 """
 import contextlib
-import csv
 import dataclasses
 import functools
 import itertools
@@ -15,6 +14,7 @@ import numpy as np
 
 import fac_tdmpc_ref as fac
 import plots
+from tables import record
 
 # robot: dim O, dim A (Figure 3), milliseconds of f_T, f_R, f_Q in TD-MPC and in Fac-TDMPC (Table 3)
 ROBOTS = {
@@ -40,23 +40,14 @@ def processor():
         return platform.processor() or platform.machine()
 
 
+TIMED = "processor", "cores", "blas", "what"  # heads of what times are of
+
+
 def machine():
-    """(processor, cores, BLAS kernel), which a time is of."""
+    """The first three of TIMED."""
     kernels = {f"{pool['internal_api']} {pool.get('architecture', '')}".strip()
                for pool in fac._thread_pools().info() if pool["user_api"] == "blas"}
     return processor(), str(fac.cores()), ", ".join(sorted(kernels))
-
-
-def record(path, column, found):
-    """Keep (what, number)s of this machine in a CSV, in place of earlier ones."""
-    rows, mine = [], {(*machine(), what): f"{number:.2f}" for what, number in found}
-    if Path(path).exists():
-        with open(path, newline="", encoding="utf-8") as file:
-            rows = [row for row in list(csv.reader(file))[1:] if tuple(row[:-1]) not in mine]
-    with fac.atomic_file(path, "w", newline="", encoding="utf-8") as file:
-        csv.writer(file, lineterminator="\n").writerows([
-            ("processor", "cores", "blas", "what", column), *rows,
-            *((*key, number) for key, number in mine.items())])
 
 
 class Predictor(fac.Workers):
@@ -232,9 +223,9 @@ def command_table3(args):
               "cores": fac.cores()}
     print_benchmark(result, args.robots)
     if args.record:
-        record(args.record, "ms", [
-            ("{robot}, {model}, {preset}, {samples} x {iterations}, {mode}".format_map(row),
-             row["ms_median"]) for row in decision])
+        record(args.record, (*TIMED, "ms"), [
+            (*machine(), "{robot}, {model}, {preset}, {samples} x {iterations}, {mode}".format_map(
+                row), row["ms_median"]) for row in decision])
     if args.figure:
         plots.drawn(draw_prediction, args.figure, prediction, args.robots)
     return result

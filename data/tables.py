@@ -3,8 +3,10 @@
 Over seeds ± is the sample deviation (n - 1); of one seed's episodes it is the deviation of just
 these returns (n). A ratio is one of means, never a mean of ratios.
 """
+import csv
 import itertools
 import json
+from pathlib import Path
 
 import numpy as np
 
@@ -30,6 +32,18 @@ def last(curve, ranks):
     values = curve[max(curve)]
     found = {"mean": float(np.mean(values)), "std": deviation(values), "seeds": len(values)}
     return {**found, "rank_return": float(np.mean(ranks[max(ranks)]))} if ranks else found
+
+
+def record(path, heads, found):
+    """Keep rows, each a number behind what it is of, in a CSV, in place of earlier ones of the
+    same."""
+    rows, mine = [], {tuple(map(str, of)): f"{number:.2f}" for *of, number in found}
+    if Path(path).exists():
+        with open(path, newline="", encoding="utf-8") as file:
+            rows = [row for row in list(csv.reader(file))[1:] if tuple(row[:-1]) not in mine]
+    with fac.atomic_file(path, "w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows([heads, *rows, *(
+            (*of, number) for of, number in mine.items())])
 
 
 def markdown(heads, rows):

@@ -26,7 +26,8 @@ import torch.nn.functional as F  # noqa: E402
 
 import fac_tdmpc_ref as fac  # noqa: E402
 import numpy_learner  # noqa: E402
-from speed import machine, record  # noqa: E402
+from speed import TIMED, machine  # noqa: E402
+from tables import record  # noqa: E402
 from torch_learner import TorchLearner  # noqa: E402
 
 
@@ -316,7 +317,8 @@ def main():
         print(f"{what:<42}{many:<10} NumPy {found[1] / per:7.1f} ms"
               f"  {peer} {found[2] / per:7.1f} ms  ratio {found[0]:.2f}", flush=True)
         if args.record and peer == "PyTorch" and "compile" not in what:
-            record(fac.DATA / "results" / "bench.csv", "ratio", [(f"{what}, {many}", found[0])])
+            record(fac.DATA / "results" / "bench.csv", (*TIMED, "ratio"), [
+                (*machine(), f"{what}, {many}", found[0])])
         return found[0]
 
     result["central_ratio"] = show("plan, TD-MPC (N = 1, latent 512)", planning(1, 6, args.turns))

@@ -1512,7 +1512,9 @@ def test_figure9_and_agreement_draw_a_model(tmp_path, monkeypatch):
         own = fresh if key.startswith("_encoder.") else student
         assert np.array_equal(value, own.params[key]), key
     found = last_json(run("figure9", "--model", "student.npz", "--episodes", "2", "--points", "20",
-                          "--json", cwd=tmp_path))  # the first to draw in its process
+                          "--json", "--record", "9.csv", cwd=tmp_path))  # draws first in a process
+    assert (tmp_path / "9.csv").read_text().splitlines()[:2] == [
+        "task,seed,what,number", f"reacher-hard,,silhouette,{found['silhouette']:.2f}"]
     assert found["silhouette"] is not None and set(found["moments"]) == {"best", "worst"}
     assert found["silhouette_untrained"] not in (None, found["silhouette"])
     assert (tmp_path / "figure9.png").read_bytes()[:4] == b"\x89PNG"
@@ -1527,7 +1529,11 @@ def test_figure9_and_agreement_draw_a_model(tmp_path, monkeypatch):
     monkeypatch.setattr(fac, "CONTROL_STEPS", 100)
     monkeypatch.setattr(fac, "cores", lambda: 0)  # all episodes in this process
     found = last_json(here("agreement", "--model", "student.npz", "--expert", ".",
-                           "--episodes", "1", "--states", "8", "--json", cwd=tmp_path))
+                           "--episodes", "1", "--states", "8", "--json", "--record", "9.csv",
+                           cwd=tmp_path))
+    rows = [row.rsplit(",", 1) for row in (tmp_path / "9.csv").read_text().splitlines()[1:]]
+    assert len(rows) == 3 + 2 * 3 + 2 * 4  # silhouettes; joints; best sums
+    assert f"{found['ceiling'][3]:.2f}" in [row[-1] for row in rows if "H = 3" in row[0]]
     assert len(found["held_out"]) == len(found["worst_episode"]) == 3
     assert np.abs(found["when"]).max() <= 1
     assert len(found["ceiling"]) == 4 and 0.5 < found["ceiling_variance"][0] <= 1
@@ -1541,6 +1547,14 @@ def test_figure9_and_agreement_draw_a_model(tmp_path, monkeypatch):
                                                        "data": [1, 2, "reacher-hard"]})
     refused(here("agreement", "--model", "student.npz", "--expert", "expert.npz", cwd=tmp_path),
             "another expert", "--expert")
+
+
+def test_numbers_of_the_same_are_kept_in_place_of_earlier_ones(tmp_path):
+    path, heads = tmp_path / "numbers.csv", ("task", "seed", "what", "number")
+    tables.record(path, heads, [("a, b", 0, "x", 1.234), ("c", 1, "x", 5)])
+    tables.record(path, heads, [("a, b", 0, "x", 2), ("a, b", 0, "y", 3)])
+    assert [*csv.reader(path.read_text().splitlines())] == [
+        [*heads], ["c", "1", "x", "5.00"], ["a, b", "0", "x", "2.00"], ["a, b", "0", "y", "3.00"]]
 
 
 # as the authors' program plans ----------------------------------------------------------
