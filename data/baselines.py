@@ -210,18 +210,18 @@ class AuthorsPlanner(fac.Planner):
 
     def __init__(self, student, expert, config, seed=0):
         super().__init__(student, config, seed)
-        self.expert, self.own.proposals = expert, self.proposals
+        self.own.proposals, self.theirs = self.proposals, fac.AgentPlanner(expert, config)
 
     def plan(self, obs):
         self.obs = np.array(obs, fac.F32)[:, None]
         return super().plan(obs)
 
     def proposals(self, _):
-        """(N, L, d, P), or None if P = 0."""
-        sizes, L, P = self.model.config, self.config.horizon + 1, self.config.pi_trajs
-        if not P:
+        """The expert's, (1, L, A, P), cut into the agents' parts, (N, L, d, P); None if P = 0."""
+        self.theirs.rngs = self.own.rngs  # an episode's
+        found = self.theirs.proposals(self.theirs.model.encode(self.obs))
+        if found is None:
             return None
-        noise = fac.policy_noise((L, 1, sizes.dim_action, P), self.own.rngs[0])
-        z = np.repeat(self.expert.encode(self.obs), P, 2)
-        actions = fac.policy_rollout(self.expert, z, noise)[:, 0, fac.agent_order(sizes)]
+        sizes, (_, L, _, P) = self.model.config, found.shape
+        actions = found[0][:, fac.agent_order(sizes)]
         return actions.reshape(L, sizes.num_agents, -1, P).swapaxes(0, 1)

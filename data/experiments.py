@@ -305,12 +305,18 @@ def identity(model, header):
         header.get("distill"), header.get("data"), model.config.num_agents, planning)}
 
 
+def load_same(task, seed, case, settings, folder):
+    """`load`; UserError unless a run's settings are of this model."""
+    model, header = load(task, seed, case, folder)
+    fac.need(identity(model, header).items() <= settings.items(), f"{case} of {task}, seed {seed}, "
+             f"in data/ or {folder}/, has changed; give the command again")
+    return model, header
+
+
 def plan_with(task, seed, case, settings, students):
     """The returns of a model: with its file's planning but for `samples` and `iterations`, on a
     robot that `joint` and `kind` disturb. students: a folder, see `load`."""
-    model, header = load(task, seed, case, students)
-    fac.need(identity(model, header).items() <= settings.items(), f"{case} of {task}, seed {seed}, "
-             f"in data/ or {students}/, has changed; give the command again")
+    model, header = load_same(task, seed, case, settings, students)
     planning = planning_for(header, settings)
     environment = (DisturbedEnvironment(task, settings["joint"], settings["kind"],
                                         planning.action_repeat) if settings.get("kind") else None)
@@ -391,8 +397,11 @@ def command_figure8(args):
 
 # ------------------------------------------------- as the authors' program plans, and no page says
 
-WAYS = {"as printed": {"pi_trajs": 0}, "proposals": {}, "sharp scores": {"pi_trajs": 0, "sharp": 1},
-        "both": {"sharp": 1}, "both, the mean": {"sharp": 1, "output": "mean"}}
+SEEN = fac.PlannerConfig.pi_trajs
+WAYS = {  # how many proposals, whether G_i is multiplied by N, what is executed
+    "as printed": (0, False, "sampled"), "proposals": (SEEN, False, "sampled"),
+    "sharp scores": (0, True, "sampled"), "both": (SEEN, True, "sampled"),
+    "both, the mean": (SEEN, True, "mean")}
 
 
 def plan_like_authors(task, seed, case, settings, folder):
@@ -400,13 +409,13 @@ def plan_like_authors(task, seed, case, settings, folder):
     the other ways of WAYS; its expert's policy alone beside it."""
     expert, theirs = fac.load_model(fac.data_file(task, "expert.npz"))
     preset, way = case.split(": ")
-    student, header = load(task, seed, preset, folder)
+    student, header = load_same(task, seed, preset, settings, folder)
     own = {key: value for key, value in fac.made_for(header, "student").items()
            if key in ("horizon", "discount", "action_repeat")}
-    sharp, way = WAYS[way].get("sharp"), {k: v for k, v in WAYS[way].items() if k != "sharp"}
-    if sharp:  # N G_i, since heads are summed over agents here, and averaged there
-        way["inverse_temperature"] = 0.5 * student.config.num_agents
-    planning = fac.PlannerConfig(**own, **way)
+    proposals, sharp, output = WAYS[way]
+    times = student.config.num_agents if sharp else 1  # heads are summed here, averaged there
+    planning = fac.PlannerConfig(**own, pi_trajs=proposals, output=output, inverse_temperature=(
+        times * fac.PlannerConfig.inverse_temperature))
     reflex = fac.PlannerConfig(**{**fac.made_for(theirs, "expert"), "prior": "own",
                                   "iterations": 0})
     for evaluation_seed in students.EVALUATION_SEEDS:
@@ -443,21 +452,15 @@ def command_authors(args):
 def report_authors(_, path, figures):
     """As the authors' program plans: mean returns, ± `students.difference`'s error of that from
     the policy's in the same episodes."""
-    lines, table = defaultdict(lambda: defaultdict(list)), []
-    for (task, _, case, _), own in settled(path, whole=False).items():
-        preset, way = case.split(": ")
-        for row in own:
-            lines[task, preset].setdefault(way, {}).setdefault(
-                row["evaluation_seed"], []).append(row)
-    for line, ways in lines.items():
-        rows = {way: sum(found.values(), []) for way, found in ways.items()}
-        first = next(iter(rows.values()))
-        cells = {way: f"{students.overall(own, 'returns'):.0f} ± "
-                 f"{students.difference(ways[way])[1]:.0f}" for way, own in rows.items()}
-        table.append((", ".join(line), len({row["seed"] for row in first}),
-                      f"{students.overall(first, 'policy_returns'):.0f}",
-                      *(cells.get(way, "-") for way in WAYS)))
-    return table, markdown(["", "students", "policy alone", *WAYS], table)
+    rows, table = [row for own in settled(path, whole=False).values() for row in own], {}
+    for line, found in students.by_line(rows).items():
+        (line, way), own = line.split(": "), sum(found.values(), [])
+        policy = f"{students.overall(own, 'policy_returns'):.0f}"
+        cells = table.setdefault(line, [line, len({row["seed"] for row in own}), policy,
+                                        *["-"] * len(WAYS)])
+        cells[3 + [*WAYS].index(way)] = (f"{students.overall(own, 'returns'):.0f} ± "
+                                         f"{students.difference(found)[1]:.0f}")
+    return [*table.values()], markdown(["", "students", "policy alone", *WAYS], table.values())
 
 
 # ---------------------------------------------------------- Figure 12: distilling on the way

@@ -280,7 +280,8 @@ def command_figure9(args):
               "moments": moments, "seconds": round(time.monotonic() - began, 1)}
     if apart is not None:
         print(f"silhouette by agent {apart:.2f}, shuffled {shuffled:.2f}, untrained {first:.2f}")
-        keep(args, header, {"silhouette": apart, "shuffled": shuffled, "untrained": first})
+        keep(args.record, task, header, {"silhouette": apart, "shuffled": shuffled,
+                                         "untrained": first})
     print(args.out)
     return result
 
@@ -373,7 +374,7 @@ def command_agreement(args):
         for name, key in (("held-out states", "held_out"), ("worst episode", "worst_episode")))])
     print(f"a sum over action dimensions, fitted, ranks the expert's G at "
           f"{', '.join(f'{x:.2f}' for x in ceiling)} (H = 0, 1, ...; noise of {NOISE})")
-    keep(args, header, {
+    keep(args.record, task, header, {
         **{f"joint {j}, {name}": x for name, key in (("held-out states", "held_out"), (
             "worst episode", "worst_episode")) for j, x in enumerate(result[key])},
         **{f"best sum, H = {H}": x for H, x in enumerate(ceiling)},
@@ -382,12 +383,11 @@ def command_agreement(args):
     return result
 
 
-def keep(args, header, found):
-    """Numbers about a student into the CSV that --record names, if it does."""
-    if args.record:
-        record(args.record, ("task", "seed", "what", "number"), [
-            (args.task or header["task"], header.get("seed", ""), what, number)
-            for what, number in found.items()])
+def keep(path, task, header, found):
+    """Numbers about a task's student into the CSV that --record names, if it does."""
+    if path:
+        record(path, ("task", "seed", "what", "number"), [
+            (task, header.get("seed", ""), what, number) for what, number in found.items()])
 
 
 def open_model(args, **kinds):
