@@ -215,6 +215,60 @@ def command_capacity(args):
     return result
 
 
+def command_experts(args):
+    """experts: students of several experts of a task, early ones among them; a model for each
+    joint, and one for all. What they keep, with an error over experts."""
+    runs = []
+    for task, seed, stage in itertools.product(args.tasks, args.seeds, args.stages):
+        path = Path(args.experts, f"{task}-{seed}-{stage}", "expert.npz").resolve()
+        expert, _ = fac.load_model(path, ["expert"])
+        about = {"preset": "default", "expert": str(path), "episodes": args.episodes,
+                 "weights": fac.checksum(expert.params.values())}
+        runs += [make_run(task, seed, f"{stage}: {case}", **about, **sizes) for case, sizes in (
+            ("a model for each joint", {"num_agents": fac.lookup_task(task)[3]}),
+            ("one model", {"num_agents": 1, "mlp_dim": students.equal_width(task, path)}))]
+    return run_all(args, functools.partial(students.distil_student, students=args.students), runs)
+
+
+PRINTED = {"60 episodes": {}, "1,000 more": {"expert_episodes": 1000, "played_share": 0.94}}
+NO_POLICY = {"the expert's search, 128 x 4": (128, 4), "the expert's search, 512 x 6": (512, 6)}
+
+
+def printed(task, seed, case, settings, folder):
+    """Part I's method (`--preset plain`): a student of more data, or states; or, one of NO_POLICY,
+    the expert itself where nothing proposes actions, which bounds what such a search can get."""
+    if case not in NO_POLICY:
+        yield from students.distil_student(task, seed, case, settings, folder)
+        return
+    expert, header = fac.load_model(fac.data_file(task, "expert.npz"))
+    samples, iterations = NO_POLICY[case]
+    planning = fac.PlannerConfig(**{**fac.made_for(header, "expert"), "pi_trajs": 0,
+                                    "samples": samples, "iterations": iterations})
+    for evaluation_seed in students.EVALUATION_SEEDS:
+        yield of_returns(fac.evaluate(expert, task, planning, settings["episodes"],
+                                      evaluation_seed, 0)["returns"], evaluation_seed)
+
+
+def command_printed(args):
+    """printed: what the method lacks as it is printed: data, states, or a policy."""
+    def cases(task):
+        for batch, (case, about), (models, sizes) in itertools.product(
+                args.batches, PRINTED.items(), {
+                    "": {}, ", one model": {"num_agents": 1, "mlp_dim": students.equal_width(task)}
+                }.items()):
+            if case in args.data:
+                yield (f"{case}, {batch} a step{models}", {
+                    "preset": "plain", "batch_size": batch, "reuse": 1, "steps": args.steps,
+                    **about, **sizes})
+
+    runs = [(task, 0, case, {}) for task, case in itertools.product(args.tasks, args.bounds)]
+    runs += [(task, seed, *of) for seed, task in itertools.product(args.seeds, args.tasks)
+             for of in cases(task)]
+    return run_all(args, functools.partial(printed, folder=args.students), [
+        make_run(*run, data=data_checksums(run[0]), episodes=args.episodes, **settings)
+        for *run, settings in runs])
+
+
 def time_students(path, tasks):
     """Measure milliseconds of tasks' decisions anew where some of a CSV's rows have only those of
     `distill`, which were longer beside other runs."""
@@ -849,6 +903,26 @@ def make_parser():
     sub.add_argument("--cases", nargs="+", default=[*students.ONE_MODEL], metavar="CASE",
                      choices=[*students.ONE_MODEL],
                      help=f"any of: {'; '.join(students.ONE_MODEL)} [all]")
+    sub.add_argument("--students", default="runs", help="leave them in TASK-SEED-CASE/ [runs]")
+    sub = add_runs("experts", command_experts, "Is it the expert? Students of several experts of "
+                   "a task, of EXPERTS/TASK-SEED-STAGE/ (expert.npz, replay.npz).",
+                   ["finger-spin"], episodes=5)
+    sub.add_argument("--experts", required=True, help="where they are")
+    sub.add_argument("--stages", nargs="+", required=True, metavar="STAGE",
+                     help="what TASK-SEED-STAGE ends in, such as decisions of training")
+    sub.add_argument("--students", default="runs", help="leave them in TASK-SEED-CASE/ [runs]")
+    sub = add_runs("printed", command_printed, "What does the printed method lack? Part I's "
+                   "(--preset plain), of more data and states, a model for each joint and one of "
+                   "equal weights; the expert's search without a policy bounds what it can get.",
+                   ["walker-run", "quadruped-walk"], episodes=5)
+    for flag, known, help in (("data", PRINTED, "the replay alone, or episodes of the expert's "
+                               "policy with noise, too"),
+                              ("bounds", NO_POLICY, "the expert's searches")):
+        sub.add_argument(f"--{flag}", nargs="*", default=[*known], choices=[*known], metavar="CASE",
+                         help=f"{help}, any of: {'; '.join(known)} [all]")
+    sub.add_argument("--batches", nargs="+", type=positive, default=[32, 512], metavar="STATES",
+                     help="states of a step, each predicted once [32 512]")
+    sub.add_argument("--steps", type=positive, default=14000, help="[14000; paper: 100000]")
     sub.add_argument("--students", default="runs", help="leave them in TASK-SEED-CASE/ [runs]")
     sub = add_runs("authors", command_authors, "Students that search as the paper prints it, from "
                    "their last plan, and as the authors' program does: the expert's noisy rollouts "

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -23,19 +24,18 @@ FASTER = "speed-up, one core: over expert / the same search"
 HEADS = ("seeds", "MPPI", "student", KEPT, "least kept", WINS,
          "the same search with the expert: kept", FASTER,
          "rank correlation of G, H = 0 / last", "minutes")
-FLAGS = {"samples": "plan-samples", "iterations": "plan-iterations", "num_agents": "num-agents",
-         "mlp_dim": "mlp-dim"}
+FLAGS = {"samples": "plan-samples", "iterations": "plan-iterations"}
 
 
 def folder(students, task, seed, case):
     """Where `distill` leaves a student: TASK-SEED, its own default, or TASK-SEED-CASE."""
-    name = "" if case == "default" else "-" + case.replace(",", "").replace(" ", "-")
+    name = "" if case == "default" else "-" + re.sub("[^a-z0-9]+", "-", case)
     return Path(students) / f"{task}-{seed}{name}"
 
 
-def sizes_of(task, num_agents=None, mlp_dim=None):
-    """A student's sizes, as `distill` makes it."""
-    expert, _ = fac.load_model(fac.data_file(task, "expert.npz"))
+def sizes_of(task, num_agents=None, mlp_dim=None, path=None):
+    """A student's sizes, as `distill` makes it, from the task's expert or another."""
+    expert, _ = fac.load_model(path or fac.data_file(task, "expert.npz"))
     config = fac.DistillConfig()
     sizes = fac.student_config(expert.config, num_agents, config.encoder_input, config.horizon + 1)
     return dataclasses.replace(sizes, mlp_dim=mlp_dim or sizes.mlp_dim)
@@ -47,10 +47,11 @@ def weights(sizes):
                if not name.endswith("_encoder"))
 
 
-def equal_width(task):
+def equal_width(task, path=None):
     """The hidden width with which one model for all joints has as many weights as a model for each
     have together."""
-    return of_equal_weights(sizes_of(task, 1), sizes_of(task), weights).mlp_dim
+    return of_equal_weights(sizes_of(task, 1, path=path), sizes_of(task, path=path),
+                            weights).mlp_dim
 
 
 ONE_MODEL = {"one model, equal weights": equal_width, "one model, 512 wide": lambda task: 512}
@@ -89,7 +90,7 @@ def time_both(expert, student, obs):
 def argue(args, chosen):
     """What `distill` of these arguments doesn't say of its student, with the search `chosen`: the
     returns of the expert in the same search, and `time_both`, for its result."""
-    expert, header = fac.load_model(path := fac.data_file(args.task, "expert.npz"))
+    expert, header = fac.load_model(path := args.expert or fac.data_file(args.task, "expert.npz"))
     student, about = fac.load_model(Path(args.out, "student.npz"), ["student"])
     own = {**fac.preset_values(fac.PlannerConfig, args.preset), **fac.made_for(header, path)}
     both = ((expert, fac.PlannerConfig(**own)),
@@ -105,10 +106,13 @@ def argue(args, chosen):
 
 def distil_student(task, seed, case, settings, students):
     """Distil a student by `distill`, which leaves it in `students`, once; a row for each evaluation
-    seed. case: a preset, or one of ONE_MODEL; settings: of FLAGS, `steps` and `episodes`."""
-    flags = [f"--{FLAGS.get(name, name)}={value}" for name, value in settings.items()]
+    seed. case: a preset, one of ONE_MODEL or, where settings name a preset, any; settings: of
+    distill's flags or FLAGS, and, for a run to be known by, an own expert's `weights`."""
+    preset = settings.pop("preset", "default" if case in ONE_MODEL else case)
+    settings.pop("weights", None)
+    flags = [f"--{FLAGS.get(name, name).replace('_', '-')}={value}"
+             for name, value in settings.items()]
     out = default = folder(students, task, seed, case)
-    preset = "default" if case in ONE_MODEL else case
     if budget := [f"{k}-{settings[k]}" for k in ("samples", "iterations") if k in settings]:
         out = default.with_name("-".join([default.name, *budget]))  # whose search is another
         if default.exists() and not out.exists():

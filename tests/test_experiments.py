@@ -140,7 +140,7 @@ def test_help_teaches():
     (commands,) = (a.choices for a in parser._actions if isinstance(a.choices, dict))
     assert set(commands) == {"table3", "figure4", "figure5", "figure6", "figure7", "figure8",
                              "figure9", "figure12", "figure13", "departures", "sweep", "students",
-                             "capacity", "authors", "agreement", "watch", "report"}
+                             "capacity", "experts", "printed", "authors", "agreement", "watch", "report"}
     assert commands.pop("figure6") is commands["table3"]
     assert all(name in parser.format_help() for name in commands)
     for name, command in commands.items():
