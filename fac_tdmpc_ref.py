@@ -33,7 +33,7 @@ action sequence that the expert's policy suggests to a plan. What a student comp
     sum over i (not for credit [D9]) -> R_h, Q_h (L, B, K) -> softmax over K -> divergence (Eq. 4)
 
 A layer is W (N, out, in), b (N, out, 1) and computes W @ x + b on x (N, in, B): samples last, so
-that activations run over long contiguous rows. A torch Linear.weight goes in as weight[None].
+that activations run over long rows. A torch Linear.weight is weight[None] here, itself in files.
 """
 from __future__ import annotations
 
@@ -372,15 +372,15 @@ class WorldModel:
         return "_pi.0.weight" in self.params
 
     def latents(self, obs, search=True):
-        """All that agents know when they plan, obs (O, B) -> (N, m, B): s^i. With priors of their
-        own: rows :m are s^i, rows m:2m what P^i reads, without a search these alone [D9]."""
+        """All that agents know when they plan, obs (O, B) -> (N, m, B): s^i. Of agents with priors
+        (N, 2m, B): s^i, then what the prior reads; without a search the latter alone [D9]."""
         x, own = self.read(obs), self.config.prior_steps > 0
         names = ["_encoder"] * (search or not own) + ["_prior_encoder"] * own
         return np.concatenate([self.encode_features(x, name=name) for name in names], 1)
 
     def prior(self, latents, steps):
         """What each agent would do without a search: `latents` -> actions (N, steps, d, B), by its
-        P^i, `prior_steps` of them, then the last again [D9]; an expert: its policy, rolled out."""
+        prior `prior_steps` of them, then the last again [D9]; an expert: its policy, rolled out."""
         if self.has_policy:
             return policy_rollout(self, latents, [F32(0)] * steps).swapaxes(0, 1)
         sizes = self.config
@@ -400,9 +400,9 @@ def networks(config, policy=False):
         found.append(("_pi", n, (m, *hidden, d)))
     if latent:
         found.append(("_expert_encoder", 1, (config.dim_obs, config.expert_enc_dim, latent)))
-    if L := config.prior_steps:
+    if steps := config.prior_steps:
         found += [("_prior_encoder", 1, (latent or config.dim_obs, config.enc_dim, n * m)),
-                  ("_prior", n, (m, *hidden, L * d))]
+                  ("_prior", n, (m, *hidden, steps * d))]
     return found
 
 
@@ -454,13 +454,13 @@ def heads_backward(model, tapes, d_shares, grads):
     by each share (N, L, B, K), or by sums of shares (fewer rows), the same for each summand."""
     n, dx = model.config.num_agents, 0
     for name, dy in zip(HEADS, d_shares):
-        dy = np.repeat(dy, n // len(dy), 0).reshape(n, 1, -1)  # a joint target's: N times
+        dy = np.repeat(dy, n // len(dy), 0).reshape(n, 1, -1)  # of a sum: the same N times
         dx += model.backward(name, tapes[name], dy, grads)
     return dx
 
 
 def unroll_backward(model, tapes, actions, dx, grads):
-    """Walk `unroll` back from its x's gradient dx, used up: adds to `grads`, returns dz, as z."""
+    """Walk `unroll` back from dx, by its x: adds to dx and to `grads`, returns dz (N, m, B)."""
     (L, _, B, K), n, m = actions.shape, model.config.num_agents, model.config.latent_dim
     for h in reversed(range(L - 1)):
         now, after = (slice(i * B * K, (i + 1) * B * K) for i in (h, h + 1))
@@ -515,14 +515,14 @@ def distill_loss(student, features, actions, targets, config, grads=None, diverg
 
 def divergences(heads, targets, config, divergence=soft_kl):
     """`distill_loss`'s result from the shares of `run_heads`; and the loss's gradients by these:
-    three (N, L, B, K), or where targets are joint (1, L, B, K), the same for all agents."""
+    three (N, L, B, K), or, for targets of the sum, (1, L, B, K), the same for all agents."""
     _, L, B, K = heads[0].shape
     lam = (config.lam ** np.arange(L) / B).astype(heads[0].dtype)[:, None]
     loss, means, d_shares = 0.0, [], []
     coefs = (config.reward_coef, config.value_coef, config.value_coef)
     for coef, shares, target in zip(coefs, heads, targets):
-        target = target.reshape(-1, L, B, K)  # one row: all agents', joint; N: each its own
-        output = shares.reshape(len(target), -1, L, B, K).sum(1)  # (1, N, ...): N; (N, 1, ...): 1
+        target = target.reshape(-1, L, B, K)  # one row: of the sum; N rows: of each share
+        output = shares.reshape(len(target), -1, L, B, K).sum(1)  # so sum N shares, or keep each
         kl, d_output = divergence(output, target, config.temperature_student,
                                   config.temperature_expert, config.kl)
         loss += coef * float((lam * kl).sum())
@@ -565,20 +565,20 @@ def perturbed_batch(expert, student, obs, actions, config, rng):
 
 
 def distill(expert, replay, config, num_agents=None, seed=0):
-    """Algorithm 1: a factored student of an expert; yields it with each step's losses.
+    """Algorithm 1 by its lines: a factored student of an expert; yields it with each step's losses.
 
-    replay: the dataset, a `Replay`. Its `starts` are the rows that H + 1 actions follow, to learn
-    from and held out; its `sequences` the g_0 of rows and these actions."""
+    replay: the dataset, a `Replay`. `starts`: rows that H + 1 actions follow, to learn from and
+    held out; `sequences`: rows' g_0 (O, B) and these actions (L, A, B)."""
     sizes = student_config(expert.config, num_agents, config.encoder_input)
     optimizer, student = new_student(expert, sizes, seed)
     starts, _ = replay.starts(config.horizon + 1, config.held_out, seed)
     for t in range(config.steps):                                                       # line 3
-        rng = stream(seed, f"pool {t}")  # as Part II's, whose first pools are the same
+        rng = stream(seed, f"pool {t}")  # the numbers that Part II's `draw` begins with
         rows = rng.choice(starts, config.batch_size)
         obs, actions = replay.sequences(rows, config.horizon + 1)                       # line 4
         batch = perturbed_batch(expert, student, obs, actions[..., None], config, rng)
         losses = distill_loss(student, *batch, config, optimizer.grads)                 # line 6
-        optimizer.step(learning_rate(config, t), config.grad_clip)                      # its line 5
+        optimizer.step(learning_rate(config, t), config.grad_clip)                      # line 5
         yield student, losses
 
 
@@ -601,7 +601,7 @@ def h_step_return(model, z, actions, config):
 
 
 def mppi(returns, mean, config, rngs, proposals=None):
-    """MPPI: refine a Gaussian over action sequences by its elites, an agent alone, once or more.
+    """MPPI: refine a Gaussian over action sequences by its elites, in every iteration anew.
 
     returns: actions (N, L, d, S) -> every G_i (N, S); mean (N, L, d): the first Gaussian's; rngs:
     one Generator for each agent; proposals (N, L, d, P): sequences that compete in every iteration.
@@ -670,9 +670,9 @@ class AgentPlanner:
             self.rngs = [np.random.Generator(np.random.SFC64(seed)) for seed in seeds]
 
     def plan(self, latents):
-        """`WorldModel.latents` (N, ., 1) -> actions (N, L, d), the first of which acts: a search
-        that begins from the agents' own priors [D9], which act without one (L = 1), or from the
-        last mean, moved on."""
+        """`WorldModel.latents` (N, ., 1) -> actions (N, L, d), the first of which acts. A search
+        begins from the agents' own priors [D9] or from the last mean, moved on; without a search
+        the priors act (L = 1)."""
         first = self.mean
         if self.config.prior == "own":
             first = self.model.prior(latents, self.mean.shape[1])[..., 0]
