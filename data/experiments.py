@@ -257,7 +257,7 @@ def command_printed(args):
                     "": {}, ", one model": {"num_agents": 1, "mlp_dim": students.equal_width(task)}
                 }.items()):
             if case in args.data:
-                yield (f"{case}, {batch} a step{models}", {
+                yield (f"{case}, {args.steps} x {batch}{models}", {
                     "preset": "plain", "batch_size": batch, "reuse": 1, "steps": args.steps,
                     **about, **sizes})
 
@@ -570,7 +570,7 @@ AUTHORS = {
 CASES = [*FIGURE4, *FIGURE5_CASES]
 BUDGET = ("data", "steps", "evaluations", "episodes", "samples", "iterations", "decisions")
 VARIED = {"figure7": ("samples", "iterations"), "figure8": ("joint", "kind"),
-          "students": ("samples", "iterations")}
+          "students": ("samples", "iterations"), "experts": ("expert",), "printed": ("steps",)}
 
 
 def one_figure(path, keys, varied):
@@ -786,6 +786,18 @@ def report_capacity(_, path, figures):
     return {"tasks": tasks}, text
 
 
+def report_experts(_, path, figures):
+    """Students of several experts of a task."""
+    rows = [row for own in settled(path, VARIED["experts"], False).values() for row in own]
+    return {"runs": len(rows)}, students.experts_table(rows)
+
+
+def report_printed(_, path, figures):
+    """The method as it is printed."""
+    rows = [row for own in settled(path, VARIED["printed"], False).values() for row in own]
+    return {"runs": len(rows)}, students.printed_table(students.by_line(rows))
+
+
 REPORT_HEAD = """# The paper's figures, here
 
 Written by `python data/experiments.py report` from the CSVs beside it; README.md says what they
@@ -801,7 +813,7 @@ agents have 26%. One agent's layers are as wide as its expert's, N agents' an Nt
 
 """
 REPORTS = {"alone": report_alone, "students": report_students, "capacity": report_capacity,
-           "authors": report_authors,
+           "experts": report_experts, "printed": report_printed, "authors": report_authors,
            "figure4": report_curves, "figure5": report_curves, "figure7": report_figure7,
            "figure8": report_figure8, "figure12": report_curves, "figure13": report_curves,
            "departures": report_curves}
@@ -819,7 +831,7 @@ def command_report(args):
             except (LookupError, ValueError, TypeError, StopIteration) as odd:
                 raise fac.UserError(f"{results / name}.csv: not {name}'s rows ({odd!r})") from None
             title = name.replace("figure", "Figure ").capitalize()
-            drawn = name not in ("alone", "students", "authors")
+            drawn = name in ("capacity", "departures") or name.startswith("figure")
             picture = f"![]({figures_from}/{name}.png)\n" if drawn else ""
             text.append(f"## {title}\n\n{table}\n{picture}")
     fac.need(result, f"{results}: no runs there; make some, e.g. with 'experiments.py figure4'")

@@ -357,3 +357,51 @@ def capacity_table(lines):
     return markdown(["task", "models", "width", "weights", "students", "expert", "student",
                      "priors", *searched, "rank of G, H = 0 / last", "ms: priors / 16 x 2 / 32 x 3",
                      "minutes, least"], found), panels
+
+
+# ------------------------------------------------------ the expert as a factor; what is printed
+
+def experts_table(rows):
+    """Students of several experts of a task, a row's seed being its expert's: means over episodes
+    of all evaluation seeds, each expert's; what is kept and what a student wins over its expert's
+    policy, ± standard error over experts. Markdown."""
+    found, own = [], {}
+    for row in rows:
+        own.setdefault((row["task"], *row["case"].split(": ")), {}).setdefault(
+            row["seed"], []).append(row)
+    for key, by_expert in sorted(own.items()):
+        groups = [by_expert[seed] for seed in sorted(by_expert)]
+        expert, policy, student = (np.array([overall(of, name) for of in groups]) for name in (
+            "expert_returns", "policy_returns", "returns"))
+        errors = (f"{x.mean():.{digits}f}" + (
+            f" ± {x.std(ddof=1) / len(x) ** 0.5:.{digits}f}" if len(x) > 1 else "")
+            for x, digits in ((student / expert, 2), (student - policy, 0)))
+        searches = (fac.budget(json.loads(of[0]["ranks"])) for of in groups)
+        found.append([*key, *(" / ".join(f"{x:.0f}" for x in of)
+                              for of in (expert, policy, student)), " / ".join(searches), *errors])
+    return markdown(["task", "decisions of training", "models", "experts", "their policies",
+                     "students", "MPPI", "kept", "student - policy"], found)
+
+
+def printed_table(lines):
+    """The method as printed, of more data or states, beside its bounds; ± standard error over
+    episodes and over students, as if these were apart. lines: `by_line`'s. Markdown."""
+    found, levels = [], {}
+    for rows in lines.values():
+        own = sum(rows.values(), [])
+        if own[0]["expert_returns"]:
+            levels[own[0]["task"]] = overall(own, "expert_returns"), overall(own, "policy_returns")
+    for rows in lines.values():
+        own = sum(rows.values(), [])
+        task, case, level = own[0]["task"], own[0]["case"], overall(own, "returns")
+        expert, policy = levels[task]
+        ranks = "-"
+        if own[0]["ranks"]:
+            ranks = " / ".join(f"{measured(own, lambda x, h=h: x['rank_correlation_returns'][h]):.2f}"
+                               for h in (0, -1))
+        error = mean_and_error(np.concatenate([[returns(row) for row in rows[seed]]
+                                               for seed in sorted(rows)], 1))[1]
+        found.append([task, case, len({row["seed"] for row in own}), f"{expert:.0f}",
+                      f"{policy:.0f}", f"{level:.0f} ± {error:.0f}", f"{level / expert:.2f}", ranks])
+    return markdown(["task", "what searches", "students", "expert", "its policy", "return", "kept",
+                     "rank of G, H = 0 / last"], found)

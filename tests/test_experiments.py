@@ -140,7 +140,8 @@ def test_help_teaches():
     (commands,) = (a.choices for a in parser._actions if isinstance(a.choices, dict))
     assert set(commands) == {"table3", "figure4", "figure5", "figure6", "figure7", "figure8",
                              "figure9", "figure12", "figure13", "departures", "sweep", "students",
-                             "capacity", "experts", "printed", "authors", "agreement", "watch", "report"}
+                             "capacity", "experts", "printed", "authors", "agreement", "watch",
+                             "report"}
     assert commands.pop("figure6") is commands["table3"]
     assert all(name in parser.format_help() for name in commands)
     for name, command in commands.items():
@@ -1185,6 +1186,75 @@ def test_one_model_is_distilled_like_a_student(monkeypatch):
         ("one model, equal weights", 1, 241), ("one model, 512 wide", 1, 512)]
     assert str(students.folder("runs", "walker-run", 4, made[0]["case"])) == (
         "runs/walker-run-4-one-model-equal-weights")
+
+
+def test_students_of_several_experts_are_known_by_their_weights(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: made.extend(runs))
+    path = tmp_path / "walker-stand-3-8000" / "expert.npz"
+    path.parent.mkdir()
+    path.write_bytes(fac.data_file("walker-stand", "expert.npz").read_bytes())
+    assert experiments.main(["experts", "--tasks", "walker-stand", "--seeds", "3", "--experts",
+                             str(tmp_path), "--stages", "8000"]) == 0
+    about = [json.loads(run["settings"]) for run in made]
+    assert [run["case"] for run in made] == ["8000: a model for each joint", "8000: one model"]
+    expert, _ = fac.load_model(path)
+    assert all(of["weights"] == fac.checksum(expert.params.values()) and of["expert"] == str(path)
+               for of in about)
+    assert [of["num_agents"] for of in about] == [6, 1]
+    sizes = [students.sizes_of("", of["num_agents"], of.get("mlp_dim"), path) for of in about]
+    each, one = map(students.weights, sizes)
+    assert abs(one / each - 1) < 0.02
+
+
+def test_experts_are_told_apart_with_an_error_over_them(tmp_path):
+    def rows(expert, student):
+        return [{"step": 9, "return_mean": student, "returns": [student], "minutes": 6.0,
+                 "expert_returns": [expert], "policy_returns": [50.0], "evaluation_seed": seed,
+                 "ranks": {"samples": 32, "iterations": 3}} for seed in (102, 101)]
+
+    write_rows(path := tmp_path / "experts.csv", [
+        ("walker-run", 1, "8000: one model", {"expert": "a"}, rows(100.0, 80.0)),
+        ("walker-run", 2, "8000: one model", {"expert": "b"}, rows(200.0, 200.0)),
+        ("walker-run", 1, "24000: one model", {"expert": "c"}, rows(100.0, 60.0))])
+    _, text = experiments.report_experts("experts", path, tmp_path)
+    final, early = ([cell.strip() for cell in line.split("|")[1:-1]] for line in
+                    text.splitlines()[2:])
+    assert early == ["walker-run", "8000", "one model", "100 / 200", "50 / 50", "80 / 200",
+                     "32 x 3 / 32 x 3", "0.90 ± 0.10", "90 ± 60"]
+    assert final[-2:] == ["0.60", "10"]
+
+
+def test_what_is_printed_stands_beside_what_its_search_can_get(tmp_path, monkeypatch):
+    short_episodes(monkeypatch)
+    made, found = [], {}
+    monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: made.extend(runs))
+    assert experiments.main(["printed", "--tasks", "walker-run", "--seeds", "0", "1", "--batches",
+                             "64", "--data", "1,000 more"]) == 0
+    assert [(run["case"], run["seed"]) for run in made] == [
+        ("the expert's search, 128 x 4", "0"), ("the expert's search, 512 x 6", "0"),
+        *(("1,000 more, 14000 x 64" + models, seed) for seed in "01" for models in (
+            "", ", one model"))]
+    about = json.loads(made[2]["settings"])
+    assert (about["preset"], about["reuse"], about["batch_size"], about["expert_episodes"]) == (
+        "plain", 1, 64, 1000)
+
+    monkeypatch.setattr(fac, "evaluate", lambda model, task, planning, *_: found.update(
+        planning=planning) or {"returns": [60.0]})
+    rows = [*experiments.printed("walker-run", 0, made[0]["case"], {"episodes": 1}, tmp_path)]
+    assert (found["planning"].pi_trajs, found["planning"].samples, found["planning"].prior) == (
+        0, 128, "last")
+    student = [{"step": 9, "return_mean": 40.0, "returns": [40.0], "minutes": 1.0,
+                "expert_returns": [80.0], "policy_returns": [70.0], "evaluation_seed": seed,
+                "ranks": {"rank_correlation_returns": [0.5, 0.25]}} for seed in (102, 101)]
+    write_rows(path := tmp_path / "printed.csv", [
+        ("walker-run", 0, made[0]["case"], {}, [{**row, "minutes": 1.0} for row in rows]),
+        ("walker-run", 0, made[2]["case"], {}, student)])
+    _, text = experiments.report_printed("printed", path, tmp_path)
+    bound, own = ([cell.strip() for cell in line.split("|")[1:-1]] for line in
+                  text.splitlines()[2:])
+    assert bound[3:] == ["80", "70", "60 ± 0", "0.75", "-"]
+    assert own[1:] == ["1,000 more, 14000 x 64", "1", "80", "70", "40 ± 0", "0.50", "0.50 / 0.25"]
 
 
 def test_capacity_is_timed_once_and_told_in_a_table(tmp_path, monkeypatch):
