@@ -179,6 +179,12 @@ def measured(rows, of):
     return np.mean([of(json.loads(row["ranks"])) for row in rows])
 
 
+def ranks(rows):
+    """The rank correlation of G of H = 0 and the last."""
+    return " / ".join(f"{measured(rows, lambda x, h=h: x['rank_correlation_returns'][h]):.2f}"
+                      for h in (0, -1))
+
+
 def cells(rows):
     """A line's HEADS, of {evaluation seed: rows by seed}."""
     if len(rows) < 2:
@@ -188,7 +194,6 @@ def cells(rows):
     faster = (measured(of, lambda x, key=key: x[key]) /
               measured(of, lambda x: x["plan_ms_student_in_process"])
               for key, of in (("plan_ms_expert", first), ("plan_ms_same_search", same)) if of)
-    ranks = (measured(first, lambda x, h=h: x["rank_correlation_returns"][h]) for h in (0, -1))
     budget = " / ".join(dict.fromkeys(
         "{samples} x {iterations}".format_map(json.loads(row["ranks"])) for row in first))
     means = [float(row["return_mean"]) for row in first]
@@ -199,8 +204,7 @@ def cells(rows):
             if all(returns(row, "policy_returns") for row in students) else "-",
             f"{kept(same, 'same_search_returns'):.2f}" if same else "-",
             " / ".join(f"{x:.1f}" for x in faster),
-            " / ".join(f"{x:.2f}" for x in ranks),
-            f"{np.mean([float(row['minutes']) for row in first]):.0f}"]
+            ranks(first), f"{np.mean([float(row['minutes']) for row in first]):.0f}"]
 
 
 def line_of(row):
@@ -346,8 +350,7 @@ def capacity_table(lines):
             task, name, sizes.mlp_dim, f"{weights(sizes) / 1e3:.0f}k", len(first), f"{expert:.0f}",
             f"{student:.0f} ± {error:.0f}", f"{played[0].mean():.0f}",
             *("{:+.0f} ± {:.0f}".format(*mean_and_error(of - played[0])) for of in played[1:]),
-            " / ".join(f"{measured(first, lambda x, h=h: x['rank_correlation_returns'][h]):.2f}"
-                       for h in (0, -1)), " / ".join(f"{x:.2f}" for x in ms),
+            ranks(first), " / ".join(f"{x:.2f}" for x in ms),
             f"{min(float(row['minutes']) for row in first):.1f}"])
         label = "a model for each joint" if case == "default" else case
         panels.setdefault(task, ({}, None))[0][label] = {
@@ -395,13 +398,10 @@ def printed_table(lines):
         own = sum(rows.values(), [])
         task, case, level = own[0]["task"], own[0]["case"], overall(own, "returns")
         expert, policy = levels[task]
-        ranks = "-"
-        if own[0]["ranks"]:
-            ranks = " / ".join(f"{measured(own, lambda x, h=h: x['rank_correlation_returns'][h]):.2f}"
-                               for h in (0, -1))
         error = mean_and_error(np.concatenate([[returns(row) for row in rows[seed]]
                                                for seed in sorted(rows)], 1))[1]
         found.append([task, case, len({row["seed"] for row in own}), f"{expert:.0f}",
-                      f"{policy:.0f}", f"{level:.0f} ± {error:.0f}", f"{level / expert:.2f}", ranks])
+                      f"{policy:.0f}", f"{level:.0f} ± {error:.0f}", f"{level / expert:.2f}",
+                      ranks(own) if own[0]["ranks"] else "-"])
     return markdown(["task", "what searches", "students", "expert", "its policy", "return", "kept",
                      "rank of G, H = 0 / last"], found)
