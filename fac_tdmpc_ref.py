@@ -150,7 +150,8 @@ def student_config(theirs, num_agents, encoder_input, prior_steps=0):
 
 def stream(seed, use, index=0):
     """The Generator of one use of a run's seed: no two uses, or indices of one, share numbers."""
-    return np.random.default_rng(seed_sequence(seed, spawn_key=(zlib.crc32(use.encode()), index)))
+    return np.random.default_rng(
+        np.random.SeedSequence(seed, spawn_key=(zlib.crc32(use.encode()), index)))
 
 
 # ==== 2. Layers: each forward beside its backward =====================================
@@ -564,15 +565,15 @@ def perturbed_batch(expert, student, obs, actions, config, rng):
     return student.read(obs), perturbed, predict(expert, z, perturbed)
 
 
-def distill(expert, replay, config, num_agents=None, seed=0):
+def distill(expert, replay, config, num_agents=None, seed=0, made=None):
     """Algorithm 1 by its lines: a factored student of an expert; yields it with each step's losses.
 
     replay: the dataset, a `Replay`. `starts`: rows that H + 1 actions follow, to learn from and
-    held out; `sequences`: rows' g_0 (O, B) and these actions (L, A, B)."""
+    held out; `sequences`: rows' g_0 (O, B), these actions (L, A, B). made: Adam, student so far."""
     sizes = student_config(expert.config, num_agents, config.encoder_input)
-    optimizer, student = new_student(expert, sizes, seed)
+    optimizer, student = made or new_student(expert, sizes, seed)
     starts, _ = replay.starts(config.horizon + 1, config.held_out, seed)
-    for t in range(config.steps):                                                       # line 3
+    for t in range(optimizer.t, config.steps):                                          # line 3
         rng = stream(seed, f"pool {t}")  # the numbers that Part II's `draw` begins with
         rows = rng.choice(starts, config.batch_size)
         obs, actions = replay.sequences(rows, config.horizon + 1)                       # line 4
@@ -755,17 +756,8 @@ def check_finite(name, value, update, lr):
 def episode_steps(action_repeat):
     """T for this many control steps a decision; UserError if an episode doesn't divide by it."""
     need(action_repeat in range(1, CONTROL_STEPS + 1) and CONTROL_STEPS % action_repeat == 0,
-         f"action_repeat: expected a divisor of {CONTROL_STEPS} (for any robot), found "
-         f"{action_repeat!r}")
+         f"action_repeat: expected a divisor of {CONTROL_STEPS}, found {action_repeat!r}")
     return CONTROL_STEPS // action_repeat
-
-
-def seed_sequence(seed, **options):
-    """NumPy's SeedSequence of a seed; None: the system's own. UserError for what is none."""
-    try:
-        return np.random.SeedSequence(seed, **options)
-    except (TypeError, ValueError):
-        raise UserError(f"seed: expected a whole number of 0 or more, found {seed!r}") from None
 
 
 RANGE = {"least": ("at least", operator.ge), "above": ("above", operator.gt),
@@ -775,40 +767,34 @@ RANGE = {"least": ("at least", operator.ge), "above": ("above", operator.gt),
 def check_settings(config):
     """UserError for a type or a value that a config's field rules out, and for two that don't go
     together. 1 becomes 1.0 where a float is meant, and NumPy's numbers Python's."""
-    for name, holds, rule in rules(config):
-        value = getattr(config, name)
-        need(holds, f"{type(config).__name__}: {name} must be {rule}, not {value!r}")
+    def must(name, holds, rule):
+        need(holds, f"{type(config).__name__}: {name} must be {rule}, not "
+             f"{getattr(config, name)!r}")
 
-
-def rules(config):
-    """(field, whether it holds, rule) of what a config's values have to fulfil: each, then all."""
     for f in dataclasses.fields(config):
         value, cls = getattr(config, f.name), type(f.default)
         kinds = {int: "iu", float: "iuf", bool: "b", str: "U"}[cls]
-        yield f.name, np.dtype(type(value)).kind in kinds, f"of type {cls.__name__}"
+        must(f.name, np.dtype(type(value)).kind in kinds, f"of type {cls.__name__}")
         bounds = {**{int: {"most": 10 ** 9}, float: {"most": 3e38}}.get(cls, {}), **f.metadata}
         for bound, (words, holds) in RANGE.items():
             if bound in bounds:
-                yield f.name, holds(value, bounds[bound]), f"{words} {bounds[bound]}"
+                must(f.name, holds(value, bounds[bound]), f"{words} {bounds[bound]}")
         object.__setattr__(config, f.name, cls(value))
     if isinstance(config, ModelConfig):
         A, each = config.dim_action, map(str, range(config.dim_action))
         agents = [n for n in range(1, A + 1) if A % n == 0]
-        yield ("num_agents", config.num_agents in agents,
-               f"one of {agents}, as {A} action dimensions are shared evenly")
+        must("num_agents", config.num_agents in agents,
+             f"one of {agents}, as {A} action dimensions are shared evenly")
         groups = [group.split(",") for group in config.groups.split("/")]
         alike = len(groups) == config.num_agents and len({len(group) for group in groups}) == 1
-        yield ("groups", not config.groups or alike and sorted(sum(groups, [])) == sorted(each),
-               f"equally many for each agent, each of 0 to {A - 1} once, as --agents 0,2/1,3")
+        must("groups", not config.groups or alike and sorted(sum(groups, [])) == sorted(each),
+             f"equally many for each agent, each of 0 to {A - 1} once, as --agents 0,2/1,3")
     elif isinstance(config, PlannerConfig):
         T = episode_steps(config.action_repeat)
-        yield "horizon", config.horizon < T, f"below {T}, an episode's decisions"
-        yield "elites", config.elites <= config.samples, f"at most samples ({config.samples})"
-        yield "min_std", config.min_std <= config.max_std, f"at most max_std ({config.max_std})"
-        yield "iterations", config.iterations or config.prior == "own", "above 0 without a prior"
-    elif isinstance(config, DistillConfig):
-        yield ("played_share", config.played_share or not config.expert_episodes,
-               "above 0 where there are expert_episodes")
+        must("horizon", config.horizon < T, f"below {T}, an episode's decisions")
+        must("elites", config.elites <= config.samples, f"at most samples ({config.samples})")
+        must("min_std", config.min_std <= config.max_std, f"at most max_std ({config.max_std})")
+        must("iterations", config.iterations or config.prior == "own", "above 0 without a prior")
 
 
 def from_dict(config_class, values, where):
@@ -882,8 +868,7 @@ def credit(expert, tapes, actions, predicted, sizes):
 
         part^i(y_h)_k = sum_{j <= h} (a_j^i,k - a_j^i,0) . (g_j^i,k + g_j^i,0) / 2,  g_j = dy_h/da_j
 
-    What these leave of y_h,k - y_h,0 is shared evenly, so that the parts add up to it. For N = 1
-    this is the joint target (a softmax ignores constants), but that both Q learn their mean.
+    What these leave of y_h,k - y_h,0 is shared evenly, so that the parts add up to it.
 
     expert: of one agent; tapes: of `unroll` and `run_heads` for its actions (L, A, B, K);
     predicted: three (L, B, K); sizes: the agents' ModelConfig. Returns the reward's parts
@@ -905,13 +890,6 @@ def credit(expert, tapes, actions, predicted, sizes):
     parts += (y - y[..., :1] - parts.sum(2))[:, :, None] / sizes.num_agents
     reward, q = parts.transpose(1, 2, 0, 3, 4)
     return [reward, q, q]
-
-
-def prior_optimizer(student):
-    """An Adam on the weights of a student's priors, which become views of its vector."""
-    adam = Adam({k: v for k, v in student.params.items() if k.startswith("_prior")})
-    student.params.update(adam.params)
-    return adam
 
 
 def prior_loss(student, x, targets, lam, grads=None):
@@ -936,15 +914,13 @@ def taught_batch(expert, student, obs, actions, config, rng):
     """`perturbed_batch` for the config's `targets`: if these are "credit", each agent's part of the
     expert's predictions, and copy 0 is what `actions` say. Perturbed actions (L, A, B, K) are in
     the order of the student's agents."""
-    if config.targets == "joint":
-        features, perturbed, targets = perturbed_batch(expert, student, obs, actions, config, rng)
-    else:
-        perturbed, z = perturbed_actions(actions, config, rng), expert.encode(obs)
-        perturbed[..., :1] = actions[..., :1]
-        predicted = predict(expert, z, perturbed, tapes := defaultdict(list))
-        targets = credit(expert, tapes, perturbed, predicted, student.config)
-        features = student.read(obs)
-    return features, perturbed[:, agent_order(student.config)], targets
+    perturbed, z, tapes = perturbed_actions(actions, config, rng), expert.encode(obs), None
+    if config.targets == "credit":
+        perturbed[..., :1], tapes = actions[..., :1], defaultdict(list)
+    targets = predict(expert, z, perturbed, tapes)
+    if config.targets == "credit":
+        targets = credit(expert, tapes, perturbed, targets, student.config)
+    return student.read(obs), perturbed[:, agent_order(student.config)], targets
 
 
 # ==== 8. The same, in less time =======================================================
@@ -1017,17 +993,14 @@ class Distiller:
         need(expert.has_policy or not (config.policy_share or config.expert_episodes or
                                        config.priors), "the expert has no policy to learn from; "
              "pass --policy-share 0 --expert-episodes 0 --no-priors")
-        need(theirs.num_agents == 1 or config.targets == "joint", f"the expert has "
-             f"{theirs.num_agents} agents, credit is for one; pass --targets joint")
         self.played = np.zeros((0, replay.dim_obs + replay.dim_action), np.float16)
         self.lengths = np.zeros(0, np.int64)
         if isinstance(num_agents, str):
             sizes["groups"], num_agents = num_agents or ",", num_agents.count("/") + 1
         needed = config.steps * config.batch_size // config.reuse
         self.pool_size = max(config.batch_size, min(POOL, needed))
-        shared = dataclasses.replace(theirs, dim_action=sizes.get("dim_action", theirs.dim_action))
         prior_steps = (config.horizon + 1) * config.priors
-        sizes = dataclasses.replace(student_config(shared, num_agents, config.encoder_input,
+        sizes = dataclasses.replace(student_config(theirs, num_agents, config.encoder_input,
                                                    prior_steps), **sizes)
         with one_thread():
             self.optimizer, self.student = self.create(expert, sizes, seed)
@@ -1134,9 +1107,8 @@ class Distiller:
 
     def ranks(self, states, discount=0.99):
         """Spearman's correlation of student and expert over 32 perturbed action sequences, mean
-        over so many held-out states, drawn evenly: of the global Q at each step h, and of G
-        (Equation 2), by which planning ranks, for each H; two (L,). 1 is the same order, as for a
-        loss of 0 (4.4)."""
+        over so many held-out states: of the global Q at each step h, and of G (Equation 2), by
+        which planning ranks, for each H; two (L,). 1 is the same order, as for a loss of 0."""
         rng, student = stream(self.seed, "rank correlation"), self.student
         config = dataclasses.replace(self.config, noise_samples=32, targets="joint")
         rows = rng.choice(self.held_out_starts, states)
@@ -1164,23 +1136,14 @@ class PlainDistiller(Distiller):
              "--plain goes without --targets, --policy-share, --expert-episodes, --reuse, --priors "
              "and --mlp-dim, and with --num-agents for --agents")
         super().__init__(expert, replay, config, num_agents, seed)
-        self._plain = distill(expert, replay, config, self.student.config.num_agents, seed)
-
-    def load(self, state):
-        """A state of the end; one that was cut off starts anew."""
-        if state["step"] == self.config.steps:
-            super().load(state)
+        self._plain = distill(expert, replay, config, num_agents, seed,
+                              (self.optimizer, self.student))
 
     def step(self):
-        """The loop's next, whose student is kept."""
+        """The loop's next."""
         with one_thread():
-            student, losses = next(self._plain)
-        self.optimizer.vector[:] = flatten({k: student.params[k] for k in self.optimizer.params})[0]
-        self.optimizer.t += 1
-        return losses
+            return next(self._plain)[1]
 
-
-# ---- How alike student and expert rank actions.
 
 def spearman(x, y):
     """Spearman's correlation over the last axis, where K values are ranked: (..., K) -> (...)."""
@@ -1192,14 +1155,10 @@ def spearman(x, y):
 
 def horizon_returns(rewards, q1, q2, discount):
     """Equation 2 for H = 0, 1, ... at once, (L, B, K), from `predict`'s global rewards and Q."""
-    rewarded, found = 0.0, []
-    for h, (reward, q) in enumerate(zip(rewards, (q1 + q2) / 2)):
-        found.append(rewarded + discount ** h * q)
-        rewarded = rewarded + discount ** h * reward
-    return np.stack(found)
+    weights = (discount ** np.arange(len(rewards)))[:, None, None]
+    rewarded = weights * rewards
+    return np.cumsum(rewarded, 0) - rewarded + weights * (q1 + q2) / 2
 
-
-# ---- Plans: `Returns` computes h_step_return.
 
 def homogeneous(params, *layers):
     """Layers of one size as [[W, b], [0, 1]], on x that ends in 1: (N, layers, out + 1, in + 1)."""
@@ -1280,16 +1239,12 @@ class Returns:
         """Both hidden layers of a pair of networks (0: dynamics and reward, 1: the two Q)."""
         first = (self.later if h else self.at_start)[pair]
         y = first @ x[:, -first.shape[2]:]
-        y = self._norm_tanh(y) if pair else elu(y)
-        after = self.second[pair] @ y.reshape(len(y), 2, -1, y.shape[2])
-        return elu(after.reshape(y.shape))
-
-    def _norm_tanh(self, y):
-        """tanh(LayerNorm(y)) of both Q."""
-        shape, y = y.shape, y.reshape(len(y), *self.shift.shape[1:3], -1)
-        y /= np.sqrt(self.spread @ (y * y) + F32(NORM_EPS))     # (N, 2, 1, S)
-        y += self.shift
-        return np.tanh(y, out=y).reshape(shape)
+        shape, y = y.shape, y.reshape(len(y), 2, -1, y.shape[2])        # (N, 2, w + 1, S)
+        if pair:  # tanh(LayerNorm(y))
+            y /= np.sqrt(self.spread @ (y * y) + F32(NORM_EPS))         # (N, 2, 1, S)
+            y += self.shift
+        y = np.tanh(y, out=y) if pair else elu(y)
+        return elu((self.second[pair] @ y).reshape(shape))
 
 
 class FastPlanner(AgentPlanner):
@@ -1363,7 +1318,7 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
     weights are copied: make a new planner when they have changed."""
 
     def __init__(self, model, config=PlannerConfig(), seed=0, workers=0):
-        self.model, self.config, sequence = model, config, seed_sequence(seed)
+        self.model, self.config, sequence = model, config, np.random.SeedSequence(seed)
         need(config.prior == "last" or model.has_policy or model.config.prior_steps,
              "the model has no prior for plans to begin from (an expert: no policy); pass "
              "--plan-prior last (evaluate: --prior last)")
@@ -1374,11 +1329,12 @@ class Planner(contextlib.ExitStack):  # whose `close` ends the workers
         self._workers = self.enter_context(Workers(_planning_worker, workers, "planning worker"))
         self._workers.send_all(others)
         self._workers.receive_all()  # they are ready: no decision waits for their start
-        self.reset(sequence.entropy)
+        self.reset(sequence.entropy)  # of None: the system's own
 
     def reset(self, seed=None):
         """Start an episode: forget the last plan's mean; a seed also starts the streams anew."""
-        seeds = [] if seed is None else seed_sequence(seed).spawn(self.model.config.num_agents)
+        agents = self.model.config.num_agents
+        seeds = [] if seed is None else np.random.SeedSequence(seed).spawn(agents)
         self._workers.send_all(seeds[part] for part in self._parts[1:])
         self.own.reset(seeds[self._parts[0]])
 
@@ -1423,8 +1379,7 @@ class Workers(contextlib.AbstractContextManager):
     """`count` processes that each run target(connection).
 
     Spawned, since fork is unsafe once BLAS has threads; with one BLAS thread each; deaf to
-    Ctrl-C, which ends the parent, whose closed pipes end them. What they work on is sent through
-    the connection: as an argument it would block the parent of a child that dies at its start."""
+    Ctrl-C, which ends the parent, whose closed pipes end them. What they work on is sent."""
 
     def __init__(self, target, count, name="worker"):
         context, self._name, self._members = multiprocessing.get_context("spawn"), name, []
@@ -1439,9 +1394,8 @@ class Workers(contextlib.AbstractContextManager):
                 self._members.append((process, here))
         except (AssertionError, AttributeError, pickle.PicklingError, OSError) as error:
             self.close()
-            raise UserError(f"no process can be started ({error}), as in a pool's, under a "
-                            "debugger, at a limit (ulimit -a): pass workers=0 (--workers 0)"
-                            ) from None
+            raise UserError(f"no process can be started ({error}), as in a pool's or at a limit "
+                            "(ulimit -a): pass workers=0 (--workers 0)") from None
 
     def __len__(self):
         return len(self._members)
@@ -1507,14 +1461,13 @@ REACHER_TARGET = {"easy": 0.05, "hard": 0.015}  # radius of the target, metres
 REACHER = DATA / "reacher.xml"  # three links; dm_control's has two
 
 
-def import_dm_control(render=False):
-    """dm_control's suite. Nothing else here imports MuJoCo. The first import of a process decides
-    whether dm_control can draw."""
+def import_dm_control():
+    """dm_control's suite. Nothing else here imports MuJoCo. Where dm_control is to draw, MUJOCO_GL
+    has to be set before."""
     backend = os.environ.get("MUJOCO_GL")
     try:
         import mujoco  # noqa: F401  (whose own renderer is the caller's)
-        if backend is None and not render:
-            os.environ["MUJOCO_GL"] = "disable"  # states only: dm_control needs no display
+        os.environ.setdefault("MUJOCO_GL", "disable")  # states only need no display
         from dm_control import suite
         suite.reacher.Physics.from_xml_string("<mujoco/>")  # other versions' import, and fail here
     except Exception as error:
@@ -1534,22 +1487,17 @@ def is_gym(task):
 
 def make_robot(task, action_repeat=None):
     """The robot of a task: dm_control's, an `Environment`, or data/gym_robot.py's of gym:ID."""
-    repeat = task_repeat(task) if action_repeat is None else action_repeat
+    repeat = () if action_repeat is None else (action_repeat,)
     if not is_gym(task):
-        return Environment(task, repeat)
+        return Environment(task, *repeat)
     if str(DATA) not in sys.path:
         sys.path.append(str(DATA))
     with optional("gymnasium, and a clone of the repository", "gym"):
         from gym_robot import GymRobot
     try:
-        return GymRobot(task.removeprefix("gym:"), repeat)
+        return GymRobot(task.removeprefix("gym:"), *repeat)
     except ValueError as error:
         raise UserError(f"{task}: {error}") from None
-
-
-def task_repeat(task):
-    """A task's control steps a decision, where a file or a setting names no others."""
-    return 1 if is_gym(task) else ACTION_REPEAT
 
 
 class Environment:
@@ -1557,22 +1505,20 @@ class Environment:
 
     Observations are dm_control's dict, concatenated in its own order, float32 (dim O,).
     Actions (dim A,) in [-1, 1] are scaled to the action spec and applied `action_repeat` times.
-    render: whether `env.physics.render` will draw, which the first of a process decides. Raises
-    UserError for an unknown task or an installation that dm_control can't work with."""
+    Raises UserError for an unknown task or an installation that dm_control can't work with."""
 
-    def __init__(self, task, action_repeat=ACTION_REPEAT, render=False):
+    def __init__(self, task, action_repeat=ACTION_REPEAT):
         self.action_repeat, self.episode_steps = action_repeat, episode_steps(action_repeat)
-        suite = import_dm_control(render)
+        suite = import_dm_control()
         domain, _, name = str(task).partition("-")
         if task in TASKS and domain == "reacher":
-            need(REACHER.exists(), f"{REACHER}: no such file; run from a clone of the repository")
             self.env = suite.reacher.control.Environment(
                 suite.reacher.Physics.from_xml_string(REACHER.read_text("ascii")),
                 suite.reacher.Reacher(REACHER_TARGET[name], random=0), time_limit=20)
         else:
             known = [*TASKS, *map("-".join, suite.ALL_TASKS)]
-            near = [] if task in known else difflib.get_close_matches(str(task), known, 1, 0)
-            need(not near, f"unknown task {task!r}; did you mean {''.join(near)!r}? Known tasks: "
+            near = difflib.get_close_matches(str(task), known, 1, 0)[0]
+            need(task in known, f"unknown task {task!r}; did you mean {near!r}? Known tasks: "
                  f"{TASK_NAMES}")
             try:
                 self.env = suite.load(domain, name, task_kwargs={"random": 0})
@@ -1613,9 +1559,8 @@ class Environment:
 
 def robot_step(robot, action, sizes, t):
     """Decision t of an episode: next observation (O,), reward, whether it is over, and whether by
-    its state, so that later value is zero: a robot's third value, if any; a fourth tells that the
-    time is over. dm_control's reward of None: the next episode has begun. What goes to and fro is
-    copied. UserError: what isn't finite."""
+    its state, so that later value is zero (a robot's third value, if any; a fourth: by the time).
+    dm_control's reward of None: the next episode has begun. UserError: what isn't finite."""
     obs, reward, *ends = robot.step(np.array(action))
     need(len(ends) < 3 and all(end in (False, True) for end in ends), f"decision {t}: expected "
          "(observation, reward), or also, True or False, whether the state ended the episode, and "
@@ -1629,18 +1574,16 @@ def robot_step(robot, action, sizes, t):
 
 @functools.cache
 def lookup_task(task):
-    """(domain, name, dim O, dim A) of a task; UserError with the nearest name otherwise."""
-    dims = TASKS.get(task)
-    if not dims:
-        with contextlib.closing(make_robot(task)) as robot:  # what it holds may be needed to play
-            dims = robot.dim_obs, robot.dim_action
-    return *task.split(":" if is_gym(task) else "-", 1), *dims
+    """(dim O, dim A) of a task; UserError with the nearest name otherwise."""
+    if task in TASKS:
+        return TASKS[task]
+    with contextlib.closing(make_robot(task)) as robot:  # what it holds may be needed to play
+        return robot.dim_obs, robot.dim_action
 
 
-def episode_seeds(seed, episodes, first=0):
-    """Seeds of an evaluation's episodes from `first` on: independent, whatever their number."""
-    streams = seed_sequence(seed, n_children_spawned=first).spawn(
-        count(episodes, "episodes", 10 ** 5))
+def episode_seeds(seed, episodes):
+    """Seeds of an evaluation's episodes: independent, whatever their number."""
+    streams = np.random.SeedSequence(seed).spawn(count(episodes, "episodes", 10 ** 5))
     return [int(s.generate_state(1)[0]) for s in streams]
 
 
@@ -1764,13 +1707,10 @@ def made_for(header, where):
     horizon, SEARCH and the header's action repeat, where it names them. Nothing else reads them."""
     found = {}
     for group, names in (("training", ()), ("distill", ()), ("planner", SEARCH)):
-        settings = header.get(group) or {}
-        need(isinstance(settings, dict), f"{where}: header: {group}: expected settings, found "
-             f"{settings!r}")
-        found.update({name: settings[name] for name in ("discount", "horizon", *names)
-                      if name in settings})
+        found.update({name: value for name, value in (header.get(group) or {}).items()
+                      if name in ("discount", "horizon", *names)})
     if "action_repeat" in header or is_gym(header.get("task")):
-        found["action_repeat"] = header.get("action_repeat", task_repeat(header.get("task")))
+        found["action_repeat"] = header.get("action_repeat", 1)  # Gymnasium's
     from_dict(PlannerConfig, found, f"{where}: header")
     return found
 
@@ -1863,8 +1803,8 @@ def episodes_of(model, task, config, seeds, environment, noise, teacher):
     action (A,), reward, seconds of planning and, with a teacher, its plan (N * L * d,). The last
     three arguments are `play`'s."""
     if environment is None:
-        with contextlib.closing(make_robot(task, config.action_repeat)) as robot:
-            yield from episodes_of(model, task, config, seeds, robot, noise, teacher)
+        with contextlib.closing(make_robot(task, config.action_repeat)) as environment:
+            yield from episodes_of(model, task, config, seeds, environment, noise, teacher)
         return
     planners, sizes = [Planner(model, of) for of in (config, teacher) if of], model.config
     T = getattr(environment, "episode_steps", episode_steps(config.action_repeat))
@@ -1914,7 +1854,7 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
     noise: each episode draws the deviation of what is added to its actions, evenly from 0 to this.
     teacher: a PlannerConfig, by which the model also plans in each state; its plans
     (E, T, N * L * d) are a fifth array."""
-    E, sizes, episodes, total = len(seeds), model.config, [], 0.0
+    E, episodes, total = len(seeds), [], 0.0
     here = episodes_of(model, task, config, seeds, environment, noise, teacher)
     with progress(label, E, "episode") as bar, contextlib.ExitStack() as stack:
         workers = workers if environment is None else 0
@@ -1926,12 +1866,9 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
             total += sum(decision[2] for decision in episodes[i])
             bar.update()
             bar.set_postfix_str(f"mean return {total / (i + 1):.0f}", False)
-    T = max(map(len, episodes), default=0)
-    found = [np.full((E, T, n), np.nan, F32) for n in (sizes.dim_obs, sizes.dim_action)]
-    found += [np.zeros((E, T)), np.full((E, T), np.nan)]
-    if teacher:
-        steps = teacher.horizon + 1 if teacher.iterations else 1
-        found.append(np.full((E, T, sizes.dim_action * steps), np.nan, F32))
+    T = max(map(len, episodes))
+    found = [np.full((E, T, *np.shape(x)), np.nan, np.result_type(x)) for x in episodes[0][0]]
+    found[2][:] = 0
     for i, decisions in enumerate(episodes):
         for array, values in zip(found, zip(*decisions)):
             array[i, :len(decisions)] = values
@@ -1949,7 +1886,7 @@ def evaluate(model, task, config, episodes=20, seed=0, workers=None, label="eval
 
 def check_task(sizes, task, what="the model"):
     """UserError if what has these sizes (a ModelConfig, a Replay) isn't for the task."""
-    found, expected = (sizes.dim_obs, sizes.dim_action), lookup_task(task)[2:]
+    found, expected = (sizes.dim_obs, sizes.dim_action), lookup_task(task)
     need(found == expected, f"{what} has (dim O, dim A) = {found}, {task} has {expected}; name the "
          "task it was made for")
 
@@ -2045,7 +1982,8 @@ def learn_priors(distiller, data, number):
     x, targets = (np.concatenate(arrays, -1) for arrays in zip(*data))
     config = dataclasses.replace(distiller.config, lr=PRIOR_LR,
                                  steps=-(-distiller.config.steps // 4))
-    adam = prior_optimizer(student)
+    adam = Adam(prior_weights(student))
+    student.params.update(adam.params)  # views of its vector
     halves = [flatten(adam.params) for _ in range(2)]
 
     def loss(part, grads):
@@ -2066,7 +2004,7 @@ def choose_by_playing(distiller, task, taught, plannings, workers=None, environm
     it searches around them by: all play the same episodes, a sixth as many as the expert's policy
     played; first the priors alone, then each search around the better ones. The best mean is kept,
     or what is cheaper and, by the differences of episodes, within a standard error or a hundredth
-    of it. Returns the planning and what was played, a list of dicts; the student has the priors."""
+    of it. Returns the planning and what was played, a list of dicts."""
     played, student = [], distiller.student
     seeds = training_seeds(distiller.seed, "choice", 0, -(-distiller.config.expert_episodes // 6))
 
@@ -2105,9 +2043,8 @@ def train_student(distiller, out, settings, planning, workers):
         header, arrays = read_npz(checkpoint, ("checkpoint",))
         same_settings(header["settings"], settings, checkpoint)
         distiller.load(arrays)
-        if distiller.t:
-            curve, before = header["curve"], header["seconds"]
-            write_curve(out / "curve.csv", CURVE, curve)  # a kill may have come before it
+        curve, before = header["curve"], header["seconds"]
+        write_curve(out / "curve.csv", CURVE, curve)  # a kill may have come before it
     elif not (out / "student.npz").exists():
         need_none(out, "config.json", "result.json", "curve.csv", "curve.png")
     began, saved = time.monotonic(), -np.inf
@@ -2261,9 +2198,7 @@ def command_distill(args):
             locked(out), players(args.workers, max(args.episodes, config.expert_episodes)) as pool:
         args.workers = pool  # all that plays from here on
         result, planning = distil_and_save(distiller, args, planning, header, out)
-        obs = replay.observation[distiller.held_out_starts[0]].astype(F32)
-        found, rows = compare(compared((expert, own), (distiller.student, planning)), obs, path,
-                              args)
+        found, rows = compare(compared((expert, own), (distiller.student, planning)), path, args)
         result.update(found)
         result.update(seconds_total=round(result["seconds_total"] + time.monotonic() - began, 1))
         write_json(out / "result.json", result)
@@ -2302,8 +2237,8 @@ def load_data(args):
 
 def distil_and_save(distiller, args, planning, header, out):
     """Algorithm 1 to its end, then the priors and the choice of a search where no flag says
-    otherwise; writes student, curve and configuration. A finished run's student stays as its file
-    has it. Returns result's part, and the student's planning."""
+    otherwise; writes student, curve and configuration, a student once. Returns result's part, and
+    the student's planning."""
     student, config, played = distiller.student, distiller.config, []
     plannings = [*dict.fromkeys(from_args(PlannerConfig, args, **{**vars(planning), **search})
                                 for search in SEARCHES if planning.prior == "own")]
@@ -2373,10 +2308,11 @@ def compared(expert, student):
     return {**found, "student": student}
 
 
-def compare(each, obs, path, args):
+def compare(each, path, args):
     """Of all that is `compared` the returns, from the record beside the expert's file `path` or
     measured, and the milliseconds of a decision in this process: result's part, a table's rows."""
     found = {"episodes": args.episodes, "eval_seed": args.eval_seed}
+    obs = np.zeros(each["expert"][0].config.dim_obs, F32)
     calls = [functools.partial(Planner(*planned).act, obs) for planned in each.values()]
     timed = 1e3 * np.median(interleaved_seconds(calls, 20, "timing"), 0)
     rows = [("", "MPPI", "return", "ms a decision", "speed-up")]
@@ -2503,9 +2439,8 @@ def make_parser():
 
     sub = add_command(commands, "distill", command_distill, "Distil a task's expert into a "
                       "factored student (Algorithm 1), then evaluate and time both with MPPI.",
-                      epilog="Given again, a cut-off run goes on; a finished one is evaluated. "
-                      "Which search a student plans with (none, 16 x 2, 32 x 3, or 32 x 3 with "
-                      "--plan-max-std 1) is chosen by playing, unless flags tell.")
+                      epilog="Given again, a cut-off run goes on; a finished one is evaluated. A "
+                      "student's search is chosen by playing, unless flags tell.")
     add = sub.add_argument
     add("--task", default="reacher-hard", help="one of: " + TASK_NAMES)
     add("--seed", type=natural, default=0, help="of distillation [0]")
@@ -2518,7 +2453,7 @@ def make_parser():
         "value of every setting that names one below (days); plain: the paper's method at this "
         "project's budget, without what it adds [D8] [D9]")
     add("--plain", action="store_true", help="Part I of the module alone, with the plain preset or "
-        "the paper's; slower, and not resumed")
+        "the paper's; slower")
     add("--expert", help="expert file, or folder with expert.npz, replay.npz [data/experts/TASK]")
     add("--replay", help="replay file [replay.npz beside the expert]")
     add("--out", help="folder for the results [runs/TASK-SEED]")
@@ -2571,7 +2506,7 @@ def run_command(parser, argv=None):
         return 2
     except KeyboardInterrupt:
         print(f"{parser.prog}: interrupted; the same command goes on from its last checkpoint, "
-              "where it keeps one (--plain: anew)", file=sys.stderr)
+              "where it keeps one", file=sys.stderr)
         return 130
     return 1 if result and result.get("failed") else 0  # an experiment's runs
 

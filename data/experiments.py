@@ -200,7 +200,7 @@ def command_students(args):
     args.steps = args.steps or config.steps
     result = run_all(args, functools.partial(students.distil_student, students=args.students),
                      distil_runs(args, lambda task: [
-                         (args.preset, {"num_agents": fac.lookup_task(task)[3]})]))
+                         (args.preset, {"num_agents": fac.lookup_task(task)[1]})]))
     time_students(Path(result["out"]), args.tasks)
     return result
 
@@ -225,7 +225,7 @@ def command_experts(args):
         about = {"preset": "default", "expert": str(path), "episodes": args.episodes,
                  "weights": fac.checksum(expert.params.values())}
         runs += [make_run(task, seed, f"{stage}: {case}", **about, **sizes) for case, sizes in (
-            ("a model for each joint", {"num_agents": fac.lookup_task(task)[3]}),
+            ("a model for each joint", {"num_agents": fac.lookup_task(task)[1]}),
             ("one model", {"num_agents": 1, "mlp_dim": students.equal_width(task, path)}))]
     return run_all(args, functools.partial(students.distil_student, students=args.students), runs)
 
@@ -314,7 +314,7 @@ def command_sweep(args):
     for settings in (points := [dict(point) for point in itertools.product(*grid)]):
         fac.DistillConfig(**{k: v for k, v in settings.items() if k != "num_agents"})
         for task in args.tasks:
-            fac.ModelConfig(*fac.lookup_task(task)[2:], settings.get("num_agents", 1))
+            fac.ModelConfig(*fac.lookup_task(task), settings.get("num_agents", 1))
     return distil_all(args, lambda task: [("sweep", settings) for settings in points])
 
 
@@ -443,7 +443,7 @@ def time_runs(runs, opened, rounds):
 def command_figure8(args):
     """figure8: every action dimension in turn disturbed, which the planner doesn't know."""
     def variants(task):
-        joints = range(fac.lookup_task(task)[3])
+        joints = range(fac.lookup_task(task)[1])
         return [{}, *({"joint": j, "kind": kind} for j in joints for kind in KINDS)]
     return run_all(args, functools.partial(plan_with, students=args.students),
                    planning_runs(args, variants))
@@ -952,8 +952,8 @@ def make_parser():
     sub.add_argument("--decisions", type=positive,
                      help="of training, a multiple of 2000 [30000; walker-walk: 48000]")
     add_runs("figure13", lambda args: distil_and_time(args, lambda task: [
-        (f"N = {n}", {"num_agents": n}) for n in range(1, fac.lookup_task(task)[3] + 1)
-        if fac.lookup_task(task)[3] % n == 0]),
+        (f"N = {n}", {"num_agents": n}) for n in range(1, fac.lookup_task(task)[1] + 1)
+        if fac.lookup_task(task)[1] % n == 0]),
              "Appendix C.2: the number of agents; returns, then milliseconds (keep the machine "
              "quiet for these).", walkers, **curve)
     for sub in map(commands.choices.get, ("figure4", "figure7", "figure13")):

@@ -573,7 +573,8 @@ def run(args):
     sizes, weights, kinds = find_expert(args.file, args.task)
     kept = own_header(args.file) if Path(args.file).suffix == ".npz" else {}
     if args.action_repeat is None:
-        args.action_repeat = kept.get("action_repeat", fac.task_repeat(args.task))
+        args.action_repeat = kept.get(
+            "action_repeat", 1 if fac.is_gym(args.task) else fac.ACTION_REPEAT)
     fac.PlannerConfig(action_repeat=args.action_repeat)  # refuses what is none
     environment = args.collect and fac.make_robot(args.task, args.action_repeat)  # or misses it
     arrays = args.replay and find_replay(args.replay, sizes, args.task)

@@ -116,7 +116,7 @@ def command_watch(args):
              f"steps, {args.model} every {configs[0].action_repeat}: they can't be shown in step")
     steps = fac.episode_steps(configs[0].action_repeat)
     fac.need(args.decisions <= steps, f"--decisions: an episode has {steps}, not {args.decisions}")
-    (seed,) = fac.episode_seeds(args.seed, 1, first=args.episode)
+    *_, seed = fac.episode_seeds(args.seed, args.episode + 1)
     episodes = [watch_episode(*found, task, seed, args.decisions, args.every)
                 for found in models]
     images = draw_frames(episodes)
@@ -211,7 +211,7 @@ def turning_points(returns, count=2):
 
 def frames_at(task, seed, actions, moments, action_repeat):
     """Pictures of an episode, played again, before these decisions, after `choose_renderer`."""
-    environment, found = fac.Environment(task, action_repeat, render=True), {}
+    environment, found = fac.Environment(task, action_repeat), {}
     environment.reset(seed)
     for t in range(max(moments) + 1):
         if t in moments:

@@ -48,7 +48,7 @@ def small_tasks():
     """The tasks in data/ whose robots have at most MOST_ACTIONS action dimensions."""
     found = sorted(path.parent.name for path in fac.EXPERTS.glob("*/expert.npz"))
     fac.need(found, f"{fac.EXPERTS}: holds no experts; name --data and --tasks")
-    return [task for task in found if fac.lookup_task(task)[3] <= MOST_ACTIONS]
+    return [task for task in found if fac.lookup_task(task)[1] <= MOST_ACTIONS]
 
 
 def load_path(task, data, name):

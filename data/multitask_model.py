@@ -115,7 +115,7 @@ def load(path):
     config = fac.from_dict(fac.ModelConfig, header.get("model"), f"{path}: header: model")
     dims, there = header.get("tasks"), f"{path}: header: tasks"
     fac.need(isinstance(dims, dict) and dims, f"{there}: expected sizes by task, found {dims!r}")
-    expected = {task: [*fac.lookup_task(task)[2:]] for task in dims}
+    expected = {task: [*fac.lookup_task(task)] for task in dims}
     fac.need(dims == expected, f"{there}: expected {expected}, found {dims}")
     of = header.get("of", {})
     fac.need(isinstance(of, dict) and all(isinstance(sums, list) for sums in of.values()),

@@ -239,7 +239,7 @@ def draw_bars(path, cells, kinds):
     figure, grid = plt.subplots(len(cells), len(kinds), squeeze=False, layout="constrained",
                                 figsize=(11, 2.8 * len(cells)), sharey="row")
     for row, (task, cases) in zip(grid, cells.items()):
-        actions = fac.lookup_task(task)[3]
+        actions = fac.lookup_task(task)[1]
         for ax, kind in zip(row, kinds):
             for i, (case, values) in enumerate(sorted(cases.items())):
                 joints = sorted(j for k, j in values if k == kind)

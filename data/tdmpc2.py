@@ -208,7 +208,7 @@ class Checkpoint:
         the task's, or its robot's: observations, actions, embedding. UserError: it can't be."""
         need(task in self.known, f"{self.path}: knows {', '.join(self.known)}, not {task}; "
              "name some of these with --tasks, or what it knows with --teacher-tasks")
-        index, (*_, dim_obs, dim_action) = self.names.index(task), fac.lookup_task(task)
+        index, (dim_obs, dim_action) = self.names.index(task), fac.lookup_task(task)
         wide, widest, E = self.sizes.dim_obs, self.sizes.dim_action, self.task_dim
         acts = np.arange(widest) < dim_action  # the older layout has no masks
         mask = acts if self.masks is None else self.masks[index]

@@ -298,7 +298,8 @@ class OnlineStudent:
         sizes = fac.student_config(expert.config, num_agents, config.encoder_input,
                                    (config.horizon + 1) * config.priors)
         self.optimizer, self.model = fac.new_student(expert, sizes, seed)
-        self.priors = fac.prior_optimizer(self.model) if config.priors else None
+        self.priors = fac.Adam(fac.prior_weights(self.model)) if config.priors else None
+        self.model.params.update(self.priors.params if self.priors else {})
         self.optimizers = {"student": self.optimizer, **(
             {"priors": self.priors} if config.priors else {})}
 
@@ -331,7 +332,7 @@ def move_target(obs, reward, back, chosen, task, action_repeat=fac.ACTION_REPEAT
     step's finger-to-target puts it where the finger is then. obs (H+1, B, 8), reward (H, B): the
     new one is that of the decision's end for all its repeated actions.
     """
-    radius = fac.REACHER_TARGET[fac.lookup_task(task)[1]] + FINGER_RADIUS
+    radius = fac.REACHER_TARGET[task.removeprefix("reacher-")] + FINGER_RADIUS
     obs[:, chosen, 3:5] -= back[chosen]
     distance = np.linalg.norm(obs[1:, chosen, 3:5], axis=-1)
     reward[:, chosen] = action_repeat * (distance <= radius)
@@ -382,7 +383,7 @@ class Training:
     """
 
     def __init__(self, args, config, planning, distilling):
-        _, _, dim_obs, dim_action = fac.lookup_task(args.task)
+        dim_obs, dim_action = fac.lookup_task(args.task)
         self.args, self.config, self.planning = args, config, planning
         sizes = fac.ModelConfig(dim_obs, dim_action, 1, config.latent_dim, config.enc_dim,
                                 config.mlp_dim)
@@ -602,7 +603,8 @@ def read_settings(args):
     """(training, planning, distillation or None) of a command line; UserError if they don't fit."""
     config = fac.from_args(ExpertConfig, args, **TRAINING_DEFAULTS)
     planning = fac.from_args(fac.PlannerConfig, args, horizon=config.horizon,
-                             discount=config.discount, action_repeat=fac.task_repeat(args.task))
+                             discount=config.discount,
+                             action_repeat=1 if fac.is_gym(args.task) else fac.ACTION_REPEAT)
     distilling = fac.from_args(fac.DistillConfig, args, **FOLLOWING_DEFAULTS)
     fac.need(0 <= args.minutes < np.inf, f"--minutes: expected 0 or more, found {args.minutes}")
     if not planning.min_std <= config.std_start <= planning.max_std:
@@ -620,7 +622,7 @@ def read_settings(args):
     for name, default in TORCH_ONLY.items():
         fac.need(args.backend == "torch" or getattr(args, name) == default,
                  f"--{name} needs --backend torch")
-    _, _, _, dim_action = fac.lookup_task(args.task)
+    _, dim_action = fac.lookup_task(args.task)
     if not args.student:
         return config, planning, None
     fac.need(distilling.batch_size <= config.batch_size, f"--distill-batch-size "

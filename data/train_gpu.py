@@ -315,7 +315,7 @@ def train(args):
     fac.need(planning.iterations, "--plan-iterations: expected at least 1, found 0")
     fac.need(len(args.start) <= len(args.tasks), f"--start: expected at most {len(args.tasks)} "
              f"files, one for each of --tasks, found {len(args.start)}")
-    sizes = [fac.ModelConfig(*fac.lookup_task(task)[2:], 1, config.latent_dim, config.enc_dim,
+    sizes = [fac.ModelConfig(*fac.lookup_task(task), 1, config.latent_dim, config.enc_dim,
                              config.mlp_dim) for task in args.tasks]
     with fac.optional("PyTorch", "torch"):
         import torch

@@ -175,7 +175,6 @@ def test_interrupt_is_one_line_and_status_130(monkeypatch, capsys):
     (["--batch-size", "9" * 23], ["batch_size", "at most 1000000000"]),
     (["--noise-std", "nan"], ["noise_std", "nan"]),
     (["--lr", "inf"], ["lr", "at most", "inf"]),
-    (["--expert-episodes", "1", "--played-share", "0"], ["played_share", "above 0", "not 0.0"]),
     (["--no-priors", "--plan-prior", "own"], ["no prior", "--plan-prior last"]),
     (["--held-out", "1"], ["held_out", "at most 0.5"]),
     (["--horizon", "40"], ["replay.npz", "two episodes of at least 41 actions"]),
@@ -881,13 +880,14 @@ def test_where_there_are_no_locks_a_run_goes_on(tmp_path, monkeypatch, missing):
 def test_what_is_kept_is_the_student_s_return_by_the_expert_s(monkeypatch):
     monkeypatch.setattr(fac, "evaluate", lambda *_: {"returns": [4.0, 8.0]})
     args = SimpleNamespace(task="x", episodes=2, eval_seed=0, workers=0, evaluate_expert=False)
-    planned = SimpleNamespace(has_policy=False), fac.PlannerConfig()
+    sizes = SimpleNamespace(dim_obs=3)
+    planned = SimpleNamespace(has_policy=False, config=sizes), fac.PlannerConfig()
     monkeypatch.setattr(fac, "recorded_returns", lambda path, model, *_: (
         [9.0, 15.0, 99.0] if model is planned[0] else [], {}))
     monkeypatch.setattr(fac, "Planner", lambda *_: SimpleNamespace(act=print))
     monkeypatch.setattr(fac, "interleaved_seconds", lambda *_: np.array([[4, 1], [6, 3], [8, 2]]))
     each = {"expert": planned, "student": (None, planned[1])}
-    found, rows = fac.compare(each, None, "expert.npz", args)
+    found, rows = fac.compare(each, "expert.npz", args)
     assert rows[1][0] == "the expert (recorded with other versions)"
     assert (found["plan_ms_expert"], found["plan_ms_student"], found["speedup"]) == (6000, 2000, 3)
     assert (found["kept"], found["expert_return_std"], found["student_return_std"]) == (0.5, 3, 2)

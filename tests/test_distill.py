@@ -1,5 +1,6 @@
 """Algorithm 1 end to end on a small expert."""
 import contextlib
+import functools
 
 import numpy as np
 import pytest
@@ -469,10 +470,26 @@ def test_the_distiller_is_algorithm_1_in_less_time(replay, monkeypatch, num_agen
     assert losses[-1, 0] < 0.97 * losses[0, 0]
 
 
+PLAIN = fac.dataclasses.replace(CONFIG, targets="joint", policy_share=0.0, reuse=1, priors=False)
+
+
+def test_a_plain_run_that_is_resumed_ends_as_the_loop_itself(replay):
+    expert = random_model(n=1, policy=True)
+    make = functools.partial(fac.PlainDistiller, expert, replay, PLAIN)
+    with contextlib.closing(make()) as first, contextlib.closing(make()) as second:
+        for _ in range(3):
+            first.step()
+        second.load(first.state())
+        for _ in range(4):
+            second.step()
+        loop = fac.distill(expert, replay, PLAIN)
+        student, _ = [next(loop) for _ in range(7)][-1]
+        assert all(np.array_equal(second.student.params[key], value)
+                   for key, value in student.params.items())
+
+
 def test_a_plain_step_takes_one_thread_as_every_other(replay, monkeypatch):
     from threadpoolctl import threadpool_limits
-    config = fac.dataclasses.replace(CONFIG, targets="joint", policy_share=0.0, reuse=1,
-                                     priors=False)
     seen = []
 
     def watched(*arguments):
@@ -484,6 +501,6 @@ def test_a_plain_step_takes_one_thread_as_every_other(replay, monkeypatch):
     plain = fac.distill
     monkeypatch.setattr(fac, "distill", watched)
     with threadpool_limits(2), contextlib.closing(
-            fac.PlainDistiller(random_model(n=1, policy=True), replay, config)) as distiller:
+            fac.PlainDistiller(random_model(n=1, policy=True), replay, PLAIN)) as distiller:
         distiller.step()
     assert set(seen) == {1}

@@ -398,7 +398,6 @@ def test_every_task_of_the_suite_works_or_says_why_not():
 def test_evaluation_seeds_are_distinct_and_do_not_depend_on_how_many():
     seeds = fac.episode_seeds(0, 50)
     assert len(set(seeds)) == 50 and seeds[:7] == fac.episode_seeds(0, 7)
-    assert seeds[4:7] == fac.episode_seeds(0, 3, first=4)
     assert all(0 <= s < 2 ** 32 for s in seeds)  # what dm_control's RandomState takes
     assert not set(seeds) & set(fac.episode_seeds(1, 50))
 
@@ -443,13 +442,12 @@ def test_a_bad_rendering_setting_is_explained():
 
 
 @pytest.mark.parametrize("before", [None, "egl"])
-@pytest.mark.parametrize("render", [False, True])
-def test_making_an_environment_leaves_the_variables_as_they_were(before, render):
+def test_making_an_environment_leaves_the_variables_as_they_were(before):
     """And MuJoCo's own renderer there, for a caller who draws in the same program."""
     code = (f"import os; before = {before!r}; os.environ.pop('MUJOCO_GL', None)\n"
             "if before: os.environ['MUJOCO_GL'] = before\n"
             "import fac_tdmpc_ref as fac\n"
-            f"try: fac.Environment('reacher-hard', render={render})\n"
+            "try: fac.Environment('reacher-hard')\n"
             "except fac.UserError as error: print(error)\n"
             "import mujoco; assert os.environ.get('MUJOCO_GL') == before\n"
             "assert hasattr(mujoco, 'GLContext')")
@@ -464,7 +462,7 @@ def test_an_environment_that_can_draw(monkeypatch):
     except fac.UserError as error:
         pytest.skip(str(error))
     done = python("import fac_tdmpc_ref as fac\n"
-                  "print(fac.Environment('reacher-hard', render=True)"
+                  "print(fac.Environment('reacher-hard')"
                   ".env.physics.render(8, 8).shape)")  # by what was chosen
     assert done.stdout == "(8, 8, 3)\n", done.stderr
 

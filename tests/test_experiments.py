@@ -1471,7 +1471,7 @@ def test_watch_writes_a_moving_picture(tmp_path, name, task):
     pytest.importorskip("matplotlib")
     image = pytest.importorskip("PIL.Image")
     pytest.importorskip("imageio_ffmpeg" if name == "x.mp4" else "PIL")
-    expert, sizes = tmp_path / "expert.npz", fac.lookup_task(task)[2:]
+    expert, sizes = tmp_path / "expert.npz", fac.lookup_task(task)
     model = fac.WorldModel.create(fac.ModelConfig(*sizes, mlp_dim=8), np.random.default_rng(0))
     fac.save_model(expert, model, {"kind": "expert", "task": task})
     done = run("watch", "--model", expert, "--beside", expert, "--decisions", "4", "--out", name,
@@ -1588,7 +1588,7 @@ def test_figure9_and_agreement_draw_a_model(tmp_path, monkeypatch):
     assert found["silhouette"] is not None and set(found["moments"]) == {"best", "worst"}
     assert found["silhouette_untrained"] not in (None, found["silhouette"])
     assert (tmp_path / "figure9.png").read_bytes()[:4] == b"\x89PNG"
-    sizes = fac.ModelConfig(*fac.lookup_task("finger-spin")[2:], 2, 4, 8, 8)  # none of the 11
+    sizes = fac.ModelConfig(*fac.lookup_task("finger-spin"), 2, 4, 8, 8)  # none of the 11
     spin = fac.WorldModel.create(sizes, np.random.default_rng(0))
     fac.save_model(tmp_path / "spin.npz", spin, {"kind": "student", "task": "finger-spin",
                                                  "planner": quick})

@@ -140,14 +140,15 @@ def test_no_record_speaks_for_a_robot_that_may_be_another_by_now(tmp_path, monke
     args = fac.make_parser().parse_args(["distill", "--task", WALK, "--episodes", "2",
                                          "--workers", "0"])
     both = (model, config), (model, config)
-    found, _ = fac.compare(fac.compared(*both), np.zeros(3), path, args)
+    found, _ = fac.compare(fac.compared(*both), path, args)
     assert (found["expert_returns"], found["expert_recorded"]) == (measured, False)
     header = {"kind": "expert", "task": WALK, "planner": {"samples": 2}}
     assert multitask.teacher_returns(model, header, path, 2, 0) == measured
 
 
 def test_a_gym_task_s_action_is_applied_once_unless_told_otherwise():
-    assert (fac.make_robot(WALK).action_repeat, fac.task_repeat("reacher-easy")) == (1, 2)
+    assert (fac.make_robot(WALK).action_repeat, fac.make_robot("reacher-easy").action_repeat) == (
+        1, 2)
     assert fac.made_for({"task": WALK}, "x") == {"action_repeat": 1}
     assert fac.made_for({"task": WALK, "action_repeat": 4}, "x") == {"action_repeat": 4}
     assert fac.made_for({"task": "reacher-easy"}, "x") == {}

@@ -535,7 +535,7 @@ def test_what_is_no_seed_is_refused_and_leaves_no_worker(seed):
     for refused in (lambda: fac.Planner(random_model(), seed=seed, workers=1),
                     lambda: fac.Planner(random_model()).reset(seed),
                     lambda: fac.stream(seed, "x"), lambda: fac.episode_seeds(seed, 2)):
-        with pytest.raises(fac.UserError, match="seed: expected a whole number of 0 or more"):
+        with pytest.raises((TypeError, ValueError)):  # NumPy's words; of a command, its own
             refused()
     assert multiprocessing.active_children() == before
 
