@@ -140,7 +140,7 @@ class Algorithm1Config(Settings):
 
 
 def student_config(theirs, num_agents, encoder_input, prior_steps=0):
-    """A student's sizes: hidden layers max(512 // N, 50) wide, of an expert whose are 512."""
+    """A student's sizes; hidden layers are max(its expert's // N, 50) wide."""
     num_agents = theirs.dim_action if num_agents is None else num_agents
     latent = theirs.num_agents * theirs.latent_dim * (encoder_input == "latent")
     return ModelConfig(theirs.dim_obs, theirs.dim_action, num_agents, prior_steps=prior_steps,
@@ -373,15 +373,15 @@ class WorldModel:
         return "_pi.0.weight" in self.params
 
     def latents(self, obs, search=True):
-        """All that agents know when they plan, obs (O, B) -> (N, m, B): s^i. Of agents with priors
-        (N, 2m, B): s^i, then what the prior reads; without a search the latter alone [D9]."""
+        """What agents plan from, obs (O, B) -> s^i (N, m, B); with priors [D9] s^i and what these
+        read, (N, 2m, B), without a search what these read alone."""
         x, own = self.read(obs), self.config.prior_steps > 0
         names = ["_encoder"] * (search or not own) + ["_prior_encoder"] * own
         return np.concatenate([self.encode_features(x, name=name) for name in names], 1)
 
     def prior(self, latents, steps):
-        """What each agent would do without a search: `latents` -> actions (N, steps, d, B), by its
-        prior `prior_steps` of them, then the last again [D9]; an expert: its policy, rolled out."""
+        """What each agent would do without a search, `latents` -> actions (N, steps, d, B): its
+        prior's `prior_steps`, the last one repeated [D9]; an expert: its policy, rolled out."""
         if self.has_policy:
             return policy_rollout(self, latents, [F32(0)] * steps).swapaxes(0, 1)
         sizes = self.config
@@ -501,7 +501,7 @@ def distill_loss(student, features, actions, targets, config, grads=None, diverg
 
     features (1, F, B): what the student's encoder reads in the first states; actions (L, A, B, K):
     perturbed; targets: what the expert predicts for them, three (L, B, K), or each agent's part,
-    (N, L, B, K) [D9], whose D add up; divergence: D. Returns loss, mean D of reward, of value."""
+    (N, L, B, K) [D9]: then D is a sum over agents. Returns loss, mean D of reward, of value."""
     tapes, encoder_tape = defaultdict(list), []
     z = student.encode_features(features, encoder_tape)
     x = unroll(student, z, actions, tapes)
@@ -574,7 +574,7 @@ def distill(expert, replay, config, num_agents=None, seed=0, made=None):
     optimizer, student = made or new_student(expert, sizes, seed)
     starts, _ = replay.starts(config.horizon + 1, config.held_out, seed)
     for t in range(optimizer.t, config.steps):                                          # line 3
-        rng = stream(seed, f"pool {t}")  # the numbers that Part II's `draw` begins with
+        rng = stream(seed, f"pool {t}")
         rows = rng.choice(starts, config.batch_size)
         obs, actions = replay.sequences(rows, config.horizon + 1)                       # line 4
         batch = perturbed_batch(expert, student, obs, actions[..., None], config, rng)
