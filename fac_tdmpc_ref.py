@@ -999,8 +999,9 @@ class Distiller:
             sizes["groups"], num_agents = num_agents or ",", num_agents.count("/") + 1
         needed = config.steps * config.batch_size // config.reuse
         self.pool_size = max(config.batch_size, min(POOL, needed))
+        shared = dataclasses.replace(theirs, dim_action=sizes.get("dim_action", theirs.dim_action))
         prior_steps = (config.horizon + 1) * config.priors
-        sizes = dataclasses.replace(student_config(theirs, num_agents, config.encoder_input,
+        sizes = dataclasses.replace(student_config(shared, num_agents, config.encoder_input,
                                                    prior_steps), **sizes)
         with one_thread():
             self.optimizer, self.student = self.create(expert, sizes, seed)
