@@ -90,9 +90,8 @@ class PlannerConfig(Settings):
     """MPPI. A model's file may name others. Raises UserError for values that can't plan."""
     samples: int = field(128, "S: sequences drawn at once [D5]", paper=512, least=1, most=10 ** 6)
     iterations: int = field(4, "of MPPI [D5]; 0: the priors act", paper=6, least=0)
-    prior: str = field("last", "first mean: the last plan's, moved on, or what each agent's own "
-                       "prior (an expert's: its policy) would do [D9]",
-                       repr=False, choices=("last", "own"))
+    prior: str = field("last", "first mean: the last plan's, moved on, or by the agents' own "
+                       "priors (an expert: policy) [D9]", repr=False, choices=("last", "own"))
     elites: int = field(0, "best, which make the next mean; 0: samples / 8 (Table 2: 64)", least=0)
     pi_trajs: int = field(24, "P: policy proposals (Table 2)", least=0, most=10 ** 6)
     horizon: int = field(3, "H of Equation 2", least=0, most=EPISODE_STEPS - 1)
@@ -306,10 +305,9 @@ class Adam:
 class WorldModel:
     """f_E, f_T, f_R, f_Q with an agent axis: TD-MPC for N = 1, Fac-TDMPC for N = A.
 
-    `params` maps TD-MPC's state-dict names to arrays with a leading agent axis, of one dtype
-    (float32; float64 to check gradients). The encoder is centralized; only experts have TD-MPC's
-    policy, `_pi`, and only students a prior for each agent, `_prior` [D9]. A student keeps of its
-    expert at most the encoder, frozen, whose latent its own encoders read [D3]."""
+    `params` maps TD-MPC's state-dict names to arrays with a leading agent axis. The encoder is
+    centralized; only experts have TD-MPC's policy, `_pi`, only students a prior for each agent,
+    `_prior` [D9], and their expert's frozen encoder, whose latent their own encoders read [D3]."""
 
     def __init__(self, config, params):
         self.config, self.params = config, params
@@ -375,9 +373,11 @@ class WorldModel:
     def latents(self, obs, search=True):
         """What agents plan from, obs (O, B) -> s^i (N, m, B); with priors [D9] s^i and what these
         read, (N, 2m, B), without a search what these read alone."""
-        x, own = self.read(obs), self.config.prior_steps > 0
-        names = ["_encoder"] * (search or not own) + ["_prior_encoder"] * own
-        return np.concatenate([self.encode_features(x, name=name) for name in names], 1)
+        x = self.read(obs)
+        if not self.config.prior_steps:
+            return self.encode_features(x)
+        e = self.encode_features(x, name="_prior_encoder")
+        return np.concatenate([self.encode_features(x), e], 1) if search else e
 
     def prior(self, latents, steps):
         """What each agent would do without a search, `latents` -> actions (N, steps, d, B): its
