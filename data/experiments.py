@@ -220,7 +220,7 @@ def command_experts(args):
     joint, and one for all. What they keep, with an error over experts."""
     runs = []
     for task, seed, stage in itertools.product(args.tasks, args.seeds, args.stages):
-        path = Path(args.experts, f"{task}-{seed}-{stage}", "expert.npz").resolve()
+        path = Path(args.experts, f"{task}-{seed}-{stage}", "expert.npz")
         expert, _ = fac.load_model(path, ["expert"])
         about = {"preset": "default", "expert": str(path), "episodes": args.episodes,
                  "weights": fac.checksum(expert.params.values())}
