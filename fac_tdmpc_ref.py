@@ -1708,7 +1708,9 @@ def made_for(header, where):
     horizon, SEARCH and the header's action repeat, where it names them. Nothing else reads them."""
     found = {}
     for group, names in (("training", ()), ("distill", ()), ("planner", SEARCH)):
-        found.update({name: value for name, value in (header.get(group) or {}).items()
+        settings = header.get(group) or {}
+        need(isinstance(settings, dict), f"{where}: header: {group}: expected settings")
+        found.update({name: value for name, value in settings.items()
                       if name in ("discount", "horizon", *names)})
     if "action_repeat" in header or is_gym(header.get("task")):
         found["action_repeat"] = header.get("action_repeat", 1)  # Gymnasium's
