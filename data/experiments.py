@@ -236,7 +236,7 @@ NO_POLICY = {"the expert's search, 128 x 4": (128, 4), "the expert's search, 512
 
 def printed(task, seed, case, settings, folder):
     """Part I's method (`--preset plain`): a student of more data, or states; or, one of NO_POLICY,
-    the expert itself where nothing proposes actions, which bounds what such a search can get."""
+    the expert itself where nothing proposes actions: its search, by perfect predictions."""
     if case not in NO_POLICY:
         yield from students.distil_student(task, seed, case, settings, folder)
         return
@@ -925,7 +925,7 @@ def make_parser():
     sub.add_argument("--students", default="runs", help="leave them in TASK-SEED-CASE/ [runs]")
     sub = add_runs("printed", command_printed, "What does the printed method lack? Part I's "
                    "(--preset plain), of more data and states, a model for each joint and one of "
-                   "equal weights; the expert's search without a policy bounds what it can get.",
+                   "equal weights; and the expert's search without its policy.",
                    ["walker-run", "quadruped-walk"], episodes=5)
     for flag, known, help in (("data", PRINTED, "the replay alone, or episodes of the expert's "
                                "policy with noise, too"),

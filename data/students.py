@@ -387,7 +387,7 @@ def experts_table(rows):
 
 
 def printed_table(lines):
-    """The method as printed, of more data or states, beside its bounds; ± standard error over
+    """The method as printed, of more data or states, beside the expert's search; ± standard error over
     episodes and over students, as if these were apart. lines: `by_line`'s. Markdown."""
     found, levels = [], {}
     for rows in lines.values():
