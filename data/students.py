@@ -387,8 +387,8 @@ def experts_table(rows):
 
 
 def printed_table(lines):
-    """The method as printed, of more data or states, beside the expert's search; ± standard error over
-    episodes and over students, as if these were apart. lines: `by_line`'s. Markdown."""
+    """The method as printed, of more data or states, beside the expert's search; ± standard error
+    over episodes and over students, as if these were apart. lines: `by_line`'s. Markdown."""
     found, levels = [], {}
     for rows in lines.values():
         own = sum(rows.values(), [])
