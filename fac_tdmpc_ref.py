@@ -674,9 +674,8 @@ class AgentPlanner:
         """`WorldModel.latents` (N, ., 1) -> actions (N, L, d), the first of which acts. A search
         begins from the agents' own priors [D9] or from the last mean, moved on; without a search
         the priors act (L = 1)."""
-        first = self.mean
-        if self.config.prior == "own":
-            first = self.model.prior(latents, self.mean.shape[1])[..., 0]
+        own = self.config.prior == "own"
+        first = self.model.prior(latents, self.mean.shape[1])[..., 0] if own else self.mean
         if not self.config.iterations:
             return first
         z = latents[:, :self.model.config.latent_dim]
@@ -795,6 +794,9 @@ def check_settings(config):
         must("elites", config.elites <= config.samples, f"at most samples ({config.samples})")
         must("min_std", config.min_std <= config.max_std, f"at most max_std ({config.max_std})")
         must("iterations", config.iterations or config.prior == "own", "above 0 without a prior")
+    elif isinstance(config, DistillConfig):
+        must("played_share", config.played_share or not config.expert_episodes,
+             "above 0 where there are expert_episodes")
 
 
 def from_dict(config_class, values, where):
@@ -2029,7 +2031,6 @@ def choose_by_playing(distiller, task, taught, plannings, workers=None, environm
     behind = (highest := max(found, key=np.mean)) - np.array(found)
     error = behind.std(1) / max(1, len(seeds) - 1) ** 0.5
     within = behind.mean(1) <= np.maximum(error, abs(highest.mean()) / 100)
-    student.params.update(taught[best])
     return plannings[int(np.argmax(within))], played
 
 
@@ -2239,9 +2240,8 @@ def load_data(args):
 
 
 def distil_and_save(distiller, args, planning, header, out):
-    """Algorithm 1 to its end, then the priors and the choice of a search where no flag says
-    otherwise; writes student, curve and configuration, a student once. Returns result's part, and
-    the student's planning."""
+    """Algorithm 1 to its end, then priors and, where no flag says otherwise, a search's choice;
+    writes student, curve and configuration. Returns result's part, and the student's planning."""
     student, config, played = distiller.student, distiller.config, []
     plannings = [*dict.fromkeys(from_args(PlannerConfig, args, **{**vars(planning), **search})
                                 for search in SEARCHES if planning.prior == "own")]

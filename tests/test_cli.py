@@ -175,6 +175,7 @@ def test_interrupt_is_one_line_and_status_130(monkeypatch, capsys):
     (["--batch-size", "9" * 23], ["batch_size", "at most 1000000000"]),
     (["--noise-std", "nan"], ["noise_std", "nan"]),
     (["--lr", "inf"], ["lr", "at most", "inf"]),
+    (["--expert-episodes", "1", "--played-share", "0"], ["played_share", "above 0", "not 0.0"]),
     (["--no-priors", "--plan-prior", "own"], ["no prior", "--plan-prior last"]),
     (["--held-out", "1"], ["held_out", "at most 0.5"]),
     (["--horizon", "40"], ["replay.npz", "two episodes of at least 41 actions"]),
