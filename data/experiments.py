@@ -252,21 +252,16 @@ def printed(task, seed, case, settings, folder):
 def command_printed(args):
     """printed: what the method lacks as it is printed: data, states, or a policy."""
     def cases(task):
-        for batch, (case, about), (models, sizes) in itertools.product(
-                args.batches, PRINTED.items(), {
-                    "": {}, ", one model": {"num_agents": 1, "mlp_dim": students.equal_width(task)}
-                }.items()):
-            if case in args.data:
-                yield (f"{case}, {args.steps} x {batch}{models}", {
-                    "preset": "plain", "batch_size": batch, "reuse": 1, "steps": args.steps,
-                    **about, **sizes})
+        models = {"": {}, ", one model": {"num_agents": 1, "mlp_dim": students.equal_width(task)}}
+        for batch, data, (name, sizes) in itertools.product(args.batches, args.data,
+                                                            models.items()):
+            yield f"{data}, {args.steps} x {batch}{name}", {
+                "preset": "plain", "batch_size": batch, "reuse": 1, **PRINTED[data], **sizes}
 
-    runs = [(task, 0, case, {}) for task, case in itertools.product(args.tasks, args.bounds)]
-    runs += [(task, seed, *of) for seed, task in itertools.product(args.seeds, args.tasks)
-             for of in cases(task)]
-    return run_all(args, functools.partial(printed, folder=args.students), [
-        make_run(*run, data=data_checksums(run[0]), episodes=args.episodes, **settings)
-        for *run, settings in runs])
+    bounds = [make_run(task, 0, case, data=data_checksums(task), episodes=args.episodes)
+              for task, case in itertools.product(args.tasks, args.bounds)]
+    return run_all(args, functools.partial(printed, folder=args.students),
+                   bounds + distil_runs(args, cases))
 
 
 def time_students(path, tasks):
@@ -506,8 +501,8 @@ def command_authors(args):
 def report_authors(_, path, figures):
     """As the authors' program plans: mean returns, ± `students.difference`'s error of that from
     the policy's in the same episodes."""
-    rows, table = [row for own in settled(path, whole=False).values() for row in own], {}
-    for line, found in students.by_line(rows).items():
+    table = {}
+    for line, found in students.by_line(settled_rows(path)).items():
         (line, way), own = line.split(": "), sum(found.values(), [])
         policy = f"{students.overall(own, 'policy_returns'):.0f}"
         cells = table.setdefault(line, [line, len({row["seed"] for row in own}), policy,
@@ -607,6 +602,11 @@ def settled(path, varied=(), whole=True):
     for task, seed, case in parts:
         print(f"{path}: {case} of {task}, seed {seed}, isn't whole: left out", file=sys.stderr)
     return {key: own for key, own in rows.items() if key[:3] not in parts}
+
+
+def settled_rows(path, varied=()):
+    """All rows of `settled` runs, also of seeds that lack some of what is varied."""
+    return [row for own in settled(path, varied, whole=False).values() for row in own]
 
 
 def curves(rows, column="return_mean"):
@@ -759,8 +759,7 @@ def report_figure8(_, path, figures):
 
 def report_students(_, path, figures):
     """Students as `distill` makes them: the README's main table, all of it, the same search."""
-    lines = students.by_line(
-        [row for own in settled(path, VARIED["students"], False).values() for row in own])
+    lines = students.by_line(settled_rows(path, VARIED["students"]))
     result, text = students.table(lines, {
         task: f"{found[1]} / {found[0]}" for task, found in AUTHORS.items()})
     return result, "\n".join([text, students.search_table(lines)])
@@ -768,7 +767,7 @@ def report_students(_, path, figures):
 
 def report_alone(_, path, figures):
     """Students whose joints have priors of their own, `students --out results/alone.csv`."""
-    rows = [row for own in settled(path, VARIED["students"], False).values() for row in own]
+    rows = settled_rows(path, VARIED["students"])
     short, table = students.alone_tables(students.by_line(rows))
     return {"runs": len(rows)}, f"{short}\n{table}"
 
@@ -788,13 +787,13 @@ def report_capacity(_, path, figures):
 
 def report_experts(_, path, figures):
     """Students of several experts of a task."""
-    rows = [row for own in settled(path, VARIED["experts"], False).values() for row in own]
+    rows = settled_rows(path, VARIED["experts"])
     return {"runs": len(rows)}, students.experts_table(rows)
 
 
 def report_printed(_, path, figures):
     """The method as it is printed."""
-    rows = [row for own in settled(path, VARIED["printed"], False).values() for row in own]
+    rows = settled_rows(path, VARIED["printed"])
     return {"runs": len(rows)}, students.printed_table(students.by_line(rows))
 
 
@@ -915,14 +914,12 @@ def make_parser():
     sub.add_argument("--cases", nargs="+", default=[*students.ONE_MODEL], metavar="CASE",
                      choices=[*students.ONE_MODEL],
                      help=f"any of: {'; '.join(students.ONE_MODEL)} [all]")
-    sub.add_argument("--students", default="runs", help="leave them in TASK-SEED-CASE/ [runs]")
     sub = add_runs("experts", command_experts, "Is it the expert? Students of several experts of "
                    "a task, of EXPERTS/TASK-SEED-STAGE/ (expert.npz, replay.npz).",
                    ["finger-spin"], episodes=5)
     sub.add_argument("--experts", required=True, help="where they are")
     sub.add_argument("--stages", nargs="+", required=True, metavar="STAGE",
                      help="what TASK-SEED-STAGE ends in, such as decisions of training")
-    sub.add_argument("--students", default="runs", help="leave them in TASK-SEED-CASE/ [runs]")
     sub = add_runs("printed", command_printed, "What does the printed method lack? Part I's "
                    "(--preset plain), of more data and states, a model for each joint and one of "
                    "equal weights; and the expert's search without its policy.",
@@ -935,7 +932,6 @@ def make_parser():
     sub.add_argument("--batches", nargs="+", type=positive, default=[32, 512], metavar="STATES",
                      help="states of a step, each predicted once [32 512]")
     sub.add_argument("--steps", type=positive, default=14000, help="[14000; paper: 100000]")
-    sub.add_argument("--students", default="runs", help="leave them in TASK-SEED-CASE/ [runs]")
     sub = add_runs("authors", command_authors, "Students that search as the paper prints it, from "
                    "their last plan, and as the authors' program does: the expert's noisy rollouts "
                    "among each agent's candidates, scores by exp(0.5 N G).",
@@ -956,6 +952,8 @@ def make_parser():
         if fac.lookup_task(task)[1] % n == 0]),
              "Appendix C.2: the number of agents; returns, then milliseconds (keep the machine "
              "quiet for these).", walkers, **curve)
+    for sub in map(commands.choices.get, ("capacity", "experts", "printed")):
+        sub.add_argument("--students", default="runs", help="leave them in TASK-SEED-CASE/ [runs]")
     for sub in map(commands.choices.get, ("figure4", "figure7", "figure13")):
         sub.add_argument("--rounds", type=positive, default=20, help="timings of each [20]")
     sub = add_runs("sweep", command_sweep, "A grid over Algorithm 1's settings and num-agents.",

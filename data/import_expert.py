@@ -573,8 +573,8 @@ def run(args):
     sizes, weights, kinds = find_expert(args.file, args.task)
     kept = own_header(args.file) if Path(args.file).suffix == ".npz" else {}
     if args.action_repeat is None:
-        args.action_repeat = kept.get(
-            "action_repeat", 1 if fac.is_gym(args.task) else fac.ACTION_REPEAT)
+        default = fac.PlannerConfig(**fac.made_for({"task": args.task}, "--task"))
+        args.action_repeat = kept.get("action_repeat", default.action_repeat)
     fac.PlannerConfig(action_repeat=args.action_repeat)  # refuses what is none
     environment = args.collect and fac.make_robot(args.task, args.action_repeat)  # or misses it
     arrays = args.replay and find_replay(args.replay, sizes, args.task)

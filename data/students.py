@@ -133,10 +133,11 @@ def distil_student(task, seed, case, settings, students):
                "ranks": {k: v for k, v in found.items() if k.startswith(MEASURED)}}
 
 
-def mean_and_spread(values, spread):
+def mean_and_spread(values, spread, digits=0):
     """'mean ± spread', or the mean of one."""
     values = np.array(values)
-    return f"{values.mean():.0f}" + (f" ± {spread(values):.0f}" if len(values) > 1 else "")
+    return " ± ".join(f"{x:.{digits}f}" for x in (
+        values.mean(), *([spread(values)] if len(values) > 1 else [])))
 
 
 def returns(row, key="returns"):
@@ -163,9 +164,13 @@ def wins(rows, key="returns", over="policy_returns"):
 
 def difference(rows, key="returns", over="policy_returns"):
     """`wins`, its mean and its error."""
-    return mean_and_error(np.concatenate([
-        [np.subtract(returns(row, key), returns(row, over)) for row in rows[seed]]
-        for seed in sorted(rows)], 1))
+    return mean_and_error(by_episode(rows, lambda row: np.subtract(returns(row, key),
+                                                                   returns(row, over))))
+
+
+def by_episode(rows, of=returns):
+    """What `of` makes of each row, (students, episodes), of {evaluation seed: rows by seed}."""
+    return np.concatenate([[of(row) for row in rows[seed]] for seed in sorted(rows)], 1)
 
 
 def mean_and_error(found):
@@ -376,9 +381,8 @@ def experts_table(rows):
         groups = [by_expert[seed] for seed in sorted(by_expert)]
         expert, policy, student = (np.array([overall(of, name) for of in groups]) for name in (
             "expert_returns", "policy_returns", "returns"))
-        errors = (f"{x.mean():.{digits}f}" + (
-            f" ± {x.std(ddof=1) / len(x) ** 0.5:.{digits}f}" if len(x) > 1 else "")
-            for x, digits in ((student / expert, 2), (student - policy, 0)))
+        errors = (mean_and_spread(x, lambda x: deviation(x) / len(x) ** 0.5, digits)
+                  for x, digits in ((student / expert, 2), (student - policy, 0)))
         searches = (fac.budget(json.loads(of[0]["ranks"])) for of in groups)
         found.append([*key, *(" / ".join(f"{x:.0f}" for x in of)
                               for of in (expert, policy, student)), " / ".join(searches), *errors])
@@ -398,8 +402,7 @@ def printed_table(lines):
         own = sum(rows.values(), [])
         task, case, level = own[0]["task"], own[0]["case"], overall(own, "returns")
         known = levels.get(task, ())  # a student's row names them
-        error = mean_and_error(np.concatenate([[returns(row) for row in rows[seed]]
-                                               for seed in sorted(rows)], 1))[1]
+        _, error = mean_and_error(by_episode(rows))
         found.append([task, case, len({row["seed"] for row in own}),
                       *([f"{x:.0f}" for x in known] or "--"), f"{level:.0f} ± {error:.0f}",
                       f"{level / known[0]:.2f}" if known else "-",

@@ -298,10 +298,10 @@ class OnlineStudent:
         sizes = fac.student_config(expert.config, num_agents, config.encoder_input,
                                    (config.horizon + 1) * config.priors)
         self.optimizer, self.model = fac.new_student(expert, sizes, seed)
-        self.priors = fac.Adam(fac.prior_weights(self.model)) if config.priors else None
-        self.model.params.update(self.priors.params if self.priors else {})
-        self.optimizers = {"student": self.optimizer, **(
-            {"priors": self.priors} if config.priors else {})}
+        self.optimizers, self.priors = {"student": self.optimizer}, None
+        if config.priors:
+            self.priors = self.optimizers["priors"] = fac.Adam(fac.prior_weights(self.model))
+            self.model.params.update(self.priors.params)  # views of its vector
 
     def update(self, expert, obs, actions):
         """One step of Algorithm 1 on the first `batch_size` of observations (O, B) and actions
@@ -604,7 +604,7 @@ def read_settings(args):
     config = fac.from_args(ExpertConfig, args, **TRAINING_DEFAULTS)
     planning = fac.from_args(fac.PlannerConfig, args, horizon=config.horizon,
                              discount=config.discount,
-                             action_repeat=1 if fac.is_gym(args.task) else fac.ACTION_REPEAT)
+                             **fac.made_for({"task": args.task}, "--task"))
     distilling = fac.from_args(fac.DistillConfig, args, **FOLLOWING_DEFAULTS)
     fac.need(0 <= args.minutes < np.inf, f"--minutes: expected 0 or more, found {args.minutes}")
     if not planning.min_std <= config.std_start <= planning.max_std:
