@@ -6,9 +6,9 @@
     python data/experiments.py report
 
 Figures 4, 5, 7, 8, 12, 13, departures, `students`, `capacity` and `sweep` are lists of runs
-(runs.py), whose rows go to one CSV each under data/results. `report` draws all but sweeps, from
-CSVs and the experts' records. Table 3 is in speed.py, section 5.6 in look.py, what is distilled in
-other ways in baselines.py, statistics and drawing in tables.py.
+(runs.py), whose rows go to a CSV under data/results. `report` draws all but sweeps, from CSVs.
+Table 3 is in speed.py, section 5.6 in look.py, what is distilled in other ways in baselines.py,
+statistics and drawing in tables.py.
 """
 import contextlib
 import csv
@@ -35,15 +35,17 @@ from runs import (  # noqa: E402
     append_rows, finished, key_of, lock, make_all, make_run, read_rows, unique, versions,
     write_rows)
 from tables import (  # noqa: E402
-    budget_cells, budgets_of, cell, draw_bars, draw_lines, halves, kept_cell, kept_difference, last,
-    markdown, of_returns)
+    budget_cells, budgets_of, cell, difference_cell, draw_bars, draw_dots, draw_lines, kept_of,
+    last, markdown, of_returns)
 
 RESULTS = fac.DATA / "results"
+CSVS = {"students": "alone", **dict.fromkeys(  # of commands, where not called like these
+    ("figure4", "figure5", "figure13", "departures"), "variants")}
 
 
 def csv_path(args):
-    """Where a command's rows go."""
-    return Path(args.out or RESULTS / f"{args.command}.csv")
+    """Where a command's rows go: of those that change one thing of a student, into one CSV."""
+    return Path(args.out or RESULTS / f"{CSVS.get(args.command, args.command)}.csv")
 
 
 def run_all(args, function, runs):
@@ -52,7 +54,7 @@ def run_all(args, function, runs):
         fac.lookup_task(task)
     path = csv_path(args)
     keys = [key for key in finished(read_rows(path)) if key[0] in args.tasks]
-    if args.command in REPORTS:
+    if CSVS.get(args.command, args.command) in REPORTS:
         one_figure(path, [*keys, *map(key_of, runs)], VARIED.get(args.command, ()))
     return make_all(path, functools.partial(of_same_data, function), runs, args.jobs,
                     getattr(args, "scheduler", None))
@@ -64,50 +66,53 @@ def planning_for(header, about):
     return fac.PlannerConfig(**{**fac.made_for(header, "model"), **own})
 
 
-def measure(model, task, planning, count, environment=None):
-    """A row's columns of the returns of `count` episodes of evaluation seed 0, in this process."""
-    return of_returns(fac.play(model, task, planning, fac.episode_seeds(0, count), 0, "evaluating",
-                               environment)[2].sum(1), 0)
+def returns_of(model, task, planning, count, evaluation_seed, environment=None):
+    """The returns of `count` episodes, played in this process."""
+    return fac.play(model, task, planning, fac.episode_seeds(evaluation_seed, count), 0,
+                    "evaluating", environment)[2].sum(1)
 
 
 # ------------------------------------------------- Figures 4, 5, 13 and sweeps: distillation
 
 def distil(task, seed, case, settings):
-    """Distil a student; a row at each evaluation. settings: of DistillConfig, and `num_agents`,
-    `evaluations` on the way, of so many `episodes`, planned with `samples` and `iterations` around
-    priors that know its plans: no search is chosen here."""
-    own = {k: settings.pop(k, v) for k, v in (("num_agents", None), ("evaluations", 1),
-                                              ("episodes", 10))}
+    """Distil a student and teach it priors; a row for each evaluation seed: returns of its search,
+    `samples` and `iterations` around priors that know its plans (none is chosen by playing here),
+    beside those of its priors alone and of the expert's policy. settings: of DistillConfig, and
+    `num_agents`, `episodes`."""
+    num_agents, count = settings.pop("num_agents", None), settings.pop("episodes", 10)
     about = {k: settings.pop(k) for k in ("samples", "iterations") if k in settings}
     config = fac.from_dict(fac.DistillConfig, settings, f"{task}, {case}")
     expert, header = fac.load_model(fac.data_file(task, "expert.npz"))
     distiller = distiller_of(case)(expert, fac.Replay(fac.data_file(task, "replay.npz")), config,
-                                   own["num_agents"], seed)
+                                   num_agents, seed)
     planning = planning_for(header, {**fac.student_planning(config), **about,
                                      "horizon": config.horizon})
-    student, environment = distiller.student, None
-    fresh = fac.prior_weights(student)
+    student, environment, row = distiller.student, None, {"step": config.steps}
     if case == "TAP":  # whose actions are others, which the expert's policy doesn't know
         environment = DecodingEnvironment(task, expert, distiller.vae, planning.action_repeat)
         planning = dataclasses.replace(planning, prior="last", max_std=2.0)
-    every = -(-config.steps // own["evaluations"])
     with contextlib.closing(distiller):
         if config.expert_episodes:
             distiller.add(*fac.expert_episodes(distiller, task, planning, 0))
         for _ in distiller.run():
-            if distiller.t % every and distiller.t < config.steps:
-                continue
-            if planning.prior == "own":  # anew, however many evaluations there are
-                student.params.update(fresh)
-                fac.teach_priors(distiller, task, planning, 0)
-            row = measure(student, task, planning, own["episodes"], environment)
-            if not environment:  # others' ranks are of the robot's actions
-                q, g = distiller.ranks(256, planning.discount)
-                row.update(rank_q=float(q[0]), rank_return=float(g[-1]))
-            yield {"step": distiller.t, **row}
+            pass
+        if planning.prior == "own":
+            fac.teach_priors(distiller, task, planning, 0)
+        if not environment:  # others' ranks are of the robot's actions
+            q, g = distiller.ranks(256, planning.discount)
+            row.update(rank_q=float(q[0]), rank_return=float(g[-1]))
+    reflex, policy = (dataclasses.replace(of, prior="own", iterations=0)
+                      for of in (planning, planning_for(header, {})))
+    for evaluation_seed in students.EVALUATION_SEEDS:
+        def returns(model, planning, environment=None):
+            return returns_of(model, task, planning, count, evaluation_seed, environment)
+        alone = planning.prior == "own" and returns(student, reflex).tolist()
+        yield {**row, **of_returns(returns(student, planning, environment), evaluation_seed),
+               "policy_returns": np.round(returns(expert, policy), 3).tolist(),
+               "ranks": {"reflex_returns": alone} if alone else {}}
 
 
-FIGURE4 = {"Fac-TDMPC": {}, "100% TD-MPC": {"num_agents": 1}, "10% TD-MPC": {}, "TAP": {}}
+FIGURE4 = {"default": {}, "N = 1": {"num_agents": 1}, "10% TD-MPC": {}, "TAP": {}}
 FIGURE5 = {  # panel: {case: settings}; every panel holds the default
     "loss": {"default": {}, "joint targets": {"targets": "joint"}, "MSE": {"targets": "joint"}},
     "noise deviation": {"default": {}, **{f"noise {x}": {"noise_std": x} for x in (0.1, 1.0, 2.0)}},
@@ -124,8 +129,7 @@ def distil_all(args, cases):
 
 def distil_runs(args, cases):
     """A run for each seed and task, and each (case, settings) of cases(task)."""
-    budget = {k: getattr(args, k, None) for k in ("steps", "evaluations", "episodes", "samples",
-                                                  "iterations")}
+    budget = {k: getattr(args, k, None) for k in ("steps", "episodes", "samples", "iterations")}
     data = {task: data_checksums(task) for task in args.tasks}
     return [make_run(task, seed, case, data=data[task], **{**budget, **settings})
             for seed, task in itertools.product(args.seeds, args.tasks)
@@ -320,7 +324,7 @@ BUDGETS = [(s, i) for s in (512, 256, 128, 64, 32, 16) for i in (6, 4, 2, 1)]
 
 def load(task, seed, case, folder):
     """A task's expert (model, header), or the student, of a case or preset, in its folder."""
-    if case == "expert":
+    if case in ("expert", "policy"):
         return fac.load_model(fac.data_file(task, "expert.npz"))
     case = "default" if case == "student" else case
     path = students.folder(folder, task, seed, case) / "student.npz"
@@ -330,13 +334,14 @@ def load(task, seed, case, folder):
     return fac.load_model(path, ["student"])
 
 
-def planning_runs(args, variants):
-    """A run for each variant (a dict) of planning with each model of each task."""
+def planning_runs(args, variants, experts):
+    """A run for each variant (a dict) of planning with each model of each task; experts: how the
+    expert plans, "expert" or "policy", its policy alone."""
     runs = []
-    for task, (case, seed) in itertools.product(
-            args.tasks, [("expert", 0), *(("student", seed) for seed in args.seeds)]):
+    for task, (case, seed) in itertools.product(args.tasks, [
+            *((case, 0) for case in experts), *(("student", seed) for seed in args.seeds)]):
         model, header = load(task, seed, case, args.students)
-        if case == "expert":
+        if case != "student":
             expert = fac.checksum(model.params.values())  # as its students' files name it
         data = header.get("data", [expert])
         fac.need(isinstance(data, list) and data[:1] == [expert], f"{args.students}/{task}-"
@@ -362,14 +367,18 @@ def load_same(task, seed, case, settings, folder):
     return model, header
 
 
-def plan_with(task, seed, case, settings, students):
+def plan_with(task, seed, case, settings, folder):
     """The returns of a model: with its file's planning but for `samples` and `iterations`, on a
-    robot that `joint` and `kind` disturb. students: a folder, see `load`."""
-    model, header = load_same(task, seed, case, settings, students)
+    robot that `joint` and `kind` disturb."""
+    model, header = load_same(task, seed, case, settings, folder)
     planning = planning_for(header, settings)
+    if case == "policy":
+        planning = dataclasses.replace(planning, prior="own", iterations=0)
     environment = (DisturbedEnvironment(task, settings["joint"], settings["kind"],
                                         planning.action_repeat) if settings.get("kind") else None)
-    yield measure(model, task, planning, settings["episodes"], environment)
+    for evaluation_seed in students.EVALUATION_SEEDS:
+        yield of_returns(returns_of(model, task, planning, settings["episodes"], evaluation_seed,
+                                    environment), evaluation_seed)
 
 
 KINDS = ("noise", "0.5", "1.5")  # an action is noise; its motor's strength
@@ -395,8 +404,9 @@ class DisturbedEnvironment(fac.Environment):
 
 def command_figure7(args):
     """figure7: samples and iterations; returns first, then milliseconds, nothing else running."""
-    runs = planning_runs(args, lambda task: [{"samples": s, "iterations": i} for s, i in BUDGETS])
-    result = run_all(args, functools.partial(plan_with, students=args.students), runs)
+    runs = planning_runs(args, lambda task: [{"samples": s, "iterations": i} for s, i in BUDGETS],
+                         ["expert"])
+    result = run_all(args, functools.partial(plan_with, folder=args.students), runs)
     return time_all(args, result, runs, lambda run: load(run["task"], run["seed"], run["case"],
                                                          args.students))
 
@@ -440,8 +450,8 @@ def command_figure8(args):
     def variants(task):
         joints = range(fac.lookup_task(task)[1])
         return [{}, *({"joint": j, "kind": kind} for j in joints for kind in KINDS)]
-    return run_all(args, functools.partial(plan_with, students=args.students),
-                   planning_runs(args, variants))
+    return run_all(args, functools.partial(plan_with, folder=args.students),
+                   planning_runs(args, variants, ["expert", "policy"]))
 
 
 # ------------------------------------------------- as the authors' program plans, and no page says
@@ -554,7 +564,7 @@ def command_figure12(args):
 
 # ------------------------------------------------------------------ report: tables, pictures
 
-# returns in the authors' logs, mean of 3 seeds, at 500k, in FIGURE4's order
+# returns in the authors' logs, mean of 3 seeds, at 500k: Fac-TDMPC, TD-MPC, 10% TD-MPC, TAP
 AUTHORS = {
     "reacher-easy": (978, 943, 980, 977), "reacher-hard": (746, 841, 836, 874),
     "hopper-hop": (349, 341, 309, 336), "fish-swim": (529, 618, 668, 169),
@@ -562,8 +572,7 @@ AUTHORS = {
     "walker-run": (809, 836, 697, 560), "quadruped-walk": (942, 954, 860, 464),
     "quadruped-run": (857, 863, 916, 825), "humanoid-stand": (735, 823, 453, 468),
     "humanoid-walk": (789, 724, 458, 227)}
-CASES = [*FIGURE4, *FIGURE5_CASES]
-BUDGET = ("data", "steps", "evaluations", "episodes", "samples", "iterations", "decisions")
+BUDGET = ("data", "steps", "episodes", "samples", "iterations", "decisions")
 VARIED = {"figure7": ("samples", "iterations"), "figure8": ("joint", "kind"),
           "students": ("samples", "iterations"), "experts": ("expert",), "printed": ("steps",)}
 
@@ -610,71 +619,41 @@ def settled_rows(path, varied=()):
 
 
 def curves(rows, column="return_mean"):
-    """{task: {case: {step: [value of each seed]}}} of finished runs, cases always in one order."""
+    """{task: {case: {step: [value of each seed]}}} of finished runs."""
     found = {}
-    for task, _, case, _ in sorted(rows, key=lambda key: (
-            CASES.index(key[2]) if key[2] in CASES else -1, len(key[2]), key)):
-        found.setdefault(task, {}).setdefault(case, {})
     for (task, _, case, _), own in rows.items():
+        curve = found.setdefault(task, {}).setdefault(case, {})
         for step, row in {float(r["step"]): r for r in own if r["step"] and r[column]}.items():
-            found[task][case].setdefault(step, []).append(float(row[column]))
+            curve.setdefault(step, []).append(float(row[column]))
     return found
 
 
-def expert_level(task, rows):
-    """The mean of an expert's recorded returns, of its own search but for the runs' samples and
-    iterations; None: no record, or the runs are of another expert."""
-    about = next((json.loads(settings) for own, _, _, settings in rows if own == task), {})
-    if not (path := fac.EXPERTS / task / "expert.npz").exists():
-        return None
-    expert, header = fac.load_model(path)
-    weights = fac.checksum(expert.params.values())
-    if about.get("data", [weights])[0] != weights:
-        return None
-    returns, _ = fac.recorded_returns(path, expert, task, planning_for(header, about), 0)
-    return float(np.mean(returns[:about.get("episodes")])) if returns else None
+def report_variants(_, path, figures):
+    """Figures 4, 5 and 13, and departures: students of which one thing is changed."""
+    rows = [row for own in settled(path).values() for row in own]
+    ms = {(row["task"], row["case"]): float(row["ms"]) for row in rows if row["ms"]}  # of one seed
+    result, text, panels = students.variants_table(students.by_line(
+        [row for row in rows if row["return_mean"]]), ms)
+    draw_dots(figures / "variants.png", panels, "return - the policy's")
+    return result, text
 
 
-def report_curves(name, path, figures):
-    """Figures 4, 5, 12, 13, departures: curves; result {task: {case: last}} and Markdown."""
-    rows = settled(path)
-    found, ranks = curves(rows), curves(rows, "rank_return")
-    levels = {task: None if name == "figure12" else expert_level(task, rows) for task in found}
-    if name == "figure12":
-        for task, cases in curves(rows, "expert_mean").items():
-            found[task] = {"student": found[task]["online"], "expert": cases["online"]}
-    panels = {task: (cases, levels[task]) for task, cases in found.items()}
-    if name == "figure5":
-        panels = {f"{task}: {panel}": ({case: cases[case] for case in own if case in cases},
-                                       levels[task])
-                  for task, cases in found.items() for panel, own in FIGURE5.items()}
-    draw_lines(figures / f"{name}.png", panels,
-               "decisions" if name == "figure12" else "gradient step")
-    result = {task: {case: last(curve, ranks[task].get(case)) for case, curve in cases.items()}
-              for task, cases in found.items()}
-    for (task, _, case, _), own in rows.items():
-        for row in own:
-            if row["ms"]:  # of one seed
-                result[task][case].update({k: float(row[k]) for k in ("ms", "ms_workers")})
-    cases = list(dict.fromkeys(case for found in result.values() for case in found))
-    heads, table = ["", *cases, "expert"], [
-        [task, *(cell(found.get(case)) for case in cases),
-         "-" if levels[task] is None else f"{levels[task]:.0f}"] for task, found in result.items()]
-    if name == "figure4":
-        heads.append("authors: " + " / ".join(FIGURE4))
-        for row in table:
-            row.append(" / ".join(map(str, AUTHORS.get(row[0], "-"))))
-    for task, level in levels.items():
-        result[task].update({"expert_recorded": level} if level is not None else {})
-    if name == "figure12":
-        heads[-1:] = ["ratio", "lag to 50 / 75 / 90%, decisions, each seed"]
-        for row in table:
-            ratio, lags = follow_up(rows, row[0])
-            result[row[0]].update(ratio=ratio, lag=lags)
-            row[-1:] = ["-" if ratio is None else f"{ratio:.2f}",
-                        "; ".join(" / ".join("never" if lag is None else str(lag) for lag in seed)
-                                  for seed in lags)]
-    return result, markdown(heads, table)
+def report_figure12(_, path, figures):
+    """Figure 12: a student that follows an expert which learns."""
+    rows, table, result = settled(path), [], {}
+    found, theirs = curves(rows), curves(rows, "expert_mean")
+    draw_lines(figures / "figure12.png", {
+        task: ({"student": own["online"], "expert": theirs[task]["online"]}, None)
+        for task, own in found.items()}, "decisions")
+    for task, own in found.items():
+        ratio, lags = follow_up(rows, task)
+        both = {"student": last(own["online"], {}), "expert": last(theirs[task]["online"], {})}
+        result[task] = {**both, "ratio": ratio, "lag": lags}
+        table.append([task, *map(cell, both.values()), "-" if ratio is None else f"{ratio:.2f}",
+                      "; ".join(" / ".join("never" if lag is None else str(lag) for lag in seed)
+                                for seed in lags)])
+    return result, markdown(["", "student", "expert", "ratio",
+                             "lag to 50 / 75 / 90%, decisions, each seed"], table)
 
 
 def follow_up(rows, task):
@@ -691,20 +670,17 @@ def follow_up(rows, task):
 def report_figure7(_, path, figures):
     """Figure 7: the cheapest budgets that keep 0.95 of what each model gets with the full one, and,
     at equal return, of the lower of both; chosen by every other episode, reported on the rest."""
-    rows, cells, split = settled(path, VARIED["figure7"]), {}, set()
-    for (task, _, case, settings), own in rows.items():
+    cells = {}
+    for (task, _, case, settings), own in settled(path, VARIED["figure7"]).items():
         about = json.loads(settings)
         into = cells.setdefault(task, {}).setdefault(case, {}).setdefault(
             (about["samples"], about["iterations"]),
             {"chosen_by": [], "return": [], "all": [], "ms": [], "ms_workers": []})
-        for row in own:
-            if row["return_mean"]:
-                found = (*halves(row), float(row["return_mean"]))
-                split.add(len(json.loads(row["returns"] or "[]")) > 1)
-                for key, value in zip(("chosen_by", "return", "all"), found):
-                    into[key].append(value)
-            for key in ("ms", "ms_workers"):
-                into[key] += [float(row[key])] if row[key] else []
+        played = [x for row in own if row["returns"] for x in json.loads(row["returns"])]
+        for key, found in (("chosen_by", played[::2]), ("return", played[1::2]), ("all", played)):
+            into[key].append(np.mean(found))
+        for key in ("ms", "ms_workers"):
+            into[key] += [float(row[key]) for row in own if row[key]]
     panels, result, table = {}, [], []
     for task, cases in cells.items():
         for axis, other, name in ((0, 6, "samples x 6"), (1, 512, "512 x iterations")):
@@ -716,59 +692,40 @@ def report_figure7(_, path, figures):
             result.append(row)
             table.append(budget_cells(row))
     draw_lines(figures / "figure7.png", panels, "samples or iterations", xscale="log")
-    note = ("Budgets are chosen by every other episode; returns are of the others."
-            if split == {True} else "Some rows hold no episode's return: there the budgets are "
-            "chosen by the episodes that they are reported on.")
     return result, markdown(
         ("", *(f"{at}: {of}" for at in ("equal return", "0.95 of its own") for of in (
             "expert", "student, one process", "with workers", "speed-up, one process / best")),
-         "kept, 512 x 6 / 128 x 4", "128 x 4: speed-up, one process / best"), table
-    ) + f"\n{note}\n"
+         "kept, 512 x 6 / 128 x 4", "128 x 4: speed-up, one process / best"), table)
 
 
 def report_figure8(_, path, figures):
-    """Figure 8: bars of the return with each action dimension disturbed; means over these, and the
-    difference of what is kept, with its interval."""
-    rows, measured = settled(path, VARIED["figure8"]), defaultdict(dict)
-    for (task, _, case, settings), own in rows.items():
-        about = json.loads(settings)
-        measured[task].setdefault(case, {}).setdefault(
-            (about.get("kind", "none"), about.get("joint", 0)), []).append(
-            next(row for row in reversed(own) if row["return_mean"]))
-    cells = {task: {case: {key: [float(row["return_mean"]) for row in found]
-                           for key, found in values.items()} for case, values in cases.items()}
-             for task, cases in measured.items()}
-    draw_bars(figures / "figure8.png", cells, KINDS)
+    """Figure 8: what is kept of the undisturbed return, mean over action dimensions, and what the
+    student keeps less the expert's and its policy's, with an interval; bars by dimension."""
+    measured = {}  # {task: {case: {(kind, joint): returns (students, episodes)}}}
+    for (task, _, case, settings), own in settled(path, VARIED["figure8"]).items():
+        about, played = json.loads(settings), [x for row in own for x in json.loads(row["returns"])]
+        measured.setdefault(task, {}).setdefault(case, {}).setdefault(
+            (about.get("kind", "none"), about.get("joint", 0)), []).append(played)
+    draw_bars(figures / "figure8.png", measured, KINDS)
     result, table = {}, []
-    for task, cases in cells.items():
-        both = set.intersection(*(set(values) for values in cases.values()))  # measured for all
-        joints = {kind: sorted(j for k, j in both if k == kind) for kind in ("none", *KINDS)}
-        result[task] = {case: {kind: float(np.mean([np.mean(values[kind, j]) for j in found]))
-                               for kind, found in joints.items() if found}
-                        for case, values in cases.items()}
-        table += [(task, case, *(f"{found[kind]:.0f}" if kind in found else "-" for kind in joints))
-                  for case, found in sorted(result[task].items())]
-        if {"expert", "student"} <= set(cases) and joints.pop("none"):
-            found = {kind: kept_difference(measured[task]["student"], measured[task]["expert"],
-                                           kind, own) for kind, own in joints.items() if own}
-            result[task]["kept"] = found
-            table.append((task, "kept: student / expert, difference", "",
-                          *(kept_cell(found.get(kind)) for kind in KINDS)))
+    for task, cases in measured.items():
+        both = set.intersection(*map(set, cases.values()))  # measured for all
+        kept = {case: {kind: kept_of(values, kind, sorted(j for k, j in both if k == kind))
+                       for kind in KINDS} for case, values in cases.items()}
+        result[task] = {case: {kind: found[0] for kind, found in own.items()}
+                        for case, own in kept.items()}
+        table += [(task, case, f"{np.mean(cases[case]['none', 0]):.0f}",
+                   *(f"{x:.2f}" for x in own.values())) for case, own in result[task].items()]
+        table += [(task, f"student - {case}", "", *(
+            difference_cell(kept["student"][kind], kept[case][kind]) for kind in KINDS))
+            for case in kept if case != "student"]
     return result, markdown(("", "", "undisturbed", *KINDS), table)
-
-
-def report_students(_, path, figures):
-    """Students as `distill` makes them: the README's main table, all of it, the same search."""
-    lines = students.by_line(settled_rows(path, VARIED["students"]))
-    result, text = students.table(lines, {
-        task: f"{found[1]} / {found[0]}" for task, found in AUTHORS.items()})
-    return result, "\n".join([text, students.search_table(lines)])
 
 
 def report_alone(_, path, figures):
     """Students whose joints have priors of their own, `students --out results/alone.csv`."""
     rows = settled_rows(path, VARIED["students"])
-    short, table = students.alone_tables(students.by_line(rows))
+    short, table = students.alone_tables(students.by_line(rows), AUTHORS)
     return {"runs": len(rows)}, f"{short}\n{table}"
 
 
@@ -800,22 +757,19 @@ def report_printed(_, path, figures):
 REPORT_HEAD = """# The paper's figures, here
 
 Written by `python data/experiments.py report` from the CSVs beside it; README.md says what they
-show. Returns: mean ± sample deviation (n - 1) over seeds (their number; one without), experts' and
-their policies' over episodes of one evaluation seed; what planning wins ± standard error; then the
-rank correlation of G; every run's settings are in its CSV. Figure 12's ratio is one of means. In
-Figure 8 what is kept is of the undisturbed return, mean over joints, with where 95% of a bootstrap
-over episodes and joints lie, bold without 0 in it; where a row holds no episode's return, its mean
-has the luck that its deviation allows, the same for all joints of a model. '10% TD-MPC' has hidden
-layers of 66 (B.2), which with Table 2's latents of 50 is 3% of the weights behind the encoder; six
-agents have 26%. One agent's layers are as wide as its expert's, N agents' an Nth of that. Figure
-13: latents of 50 an agent, so 50 N in all. Minutes are of a core while others distil beside it.
+show. Returns are means over students and episodes of evaluation seeds 101 and 102, ± standard
+error over both; G's rank correlation is of 256 held-out states; every run's settings are in its
+CSV. Figure 7's budgets are chosen by every other episode, returns are of the others; figure 8's
+intervals are of 95% of a bootstrap over episodes and joints, bold without 0 in them; figure 12's
+ratio is one of means. '10% TD-MPC' has hidden layers of 66 (B.2), which with Table
+2's latents of 50 is 3% of the weights behind the encoder; six agents have 26%. One agent's layers
+are as wide as its expert's, N agents' an Nth of that; latents are of 50 an agent. Minutes are of a
+core while others distil beside it.
 
 """
-REPORTS = {"alone": report_alone, "students": report_students, "capacity": report_capacity,
-           "experts": report_experts, "printed": report_printed, "authors": report_authors,
-           "figure4": report_curves, "figure5": report_curves, "figure7": report_figure7,
-           "figure8": report_figure8, "figure12": report_curves, "figure13": report_curves,
-           "departures": report_curves}
+REPORTS = {"alone": report_alone, "capacity": report_capacity, "experts": report_experts,
+           "printed": report_printed, "authors": report_authors, "variants": report_variants,
+           "figure7": report_figure7, "figure8": report_figure8, "figure12": report_figure12}
 
 
 def command_report(args):
@@ -830,7 +784,7 @@ def command_report(args):
             except (LookupError, ValueError, TypeError, StopIteration) as odd:
                 raise fac.UserError(f"{results / name}.csv: not {name}'s rows ({odd!r})") from None
             title = name.replace("figure", "Figure ").capitalize()
-            drawn = name in ("capacity", "departures") or name.startswith("figure")
+            drawn = name in ("capacity", "variants") or name.startswith("figure")
             picture = f"![]({figures_from}/{name}.png)\n" if drawn else ""
             text.append(f"## {title}\n\n{table}\n{picture}")
     fac.need(result, f"{results}: no runs there; make some, e.g. with 'experiments.py figure4'")
@@ -859,14 +813,12 @@ def make_parser():
                          metavar="SEED", help="[0 1 2]")
         sub.add_argument("--jobs", type=positive, default=fac.cores(),
                          help="runs at a time [one for each core]")
-        sub.add_argument("--out", help=f"the CSV [data/results/{name}.csv]")
+        sub.add_argument("--out", help=f"the CSV [data/results/{CSVS.get(name, name)}.csv]")
         sub.add_argument("--episodes", type=positive, default=defaults["episodes"],
                          help="of each evaluation [%(default)s]")
         if "steps" in defaults:
             sub.add_argument("--steps", type=positive, default=defaults["steps"],
                              help="gradient steps [%(default)s; paper: 100000]")
-            sub.add_argument("--evaluations", type=positive, default=defaults["evaluations"],
-                             help="of a run at most, evenly over its steps [%(default)s]")
             for name in ("samples", "iterations"):
                 sub.add_argument(f"--{name}", type=positive, help="MPPI's, in evaluations "
                                  f"[{fac.STUDENT_PLANNING[name]}]")
@@ -874,12 +826,12 @@ def make_parser():
 
     def add_cases(name, run, cases, help, tasks):
         sub = add_runs(name, lambda args: run(args, lambda _: [
-            (case, cases[case]) for case in args.cases]), help, tasks, **curve)
+            (case, cases[case]) for case in args.cases]), help, tasks, **budget)
         sub.add_argument("--cases", nargs="+", default=[*cases], choices=[*cases], metavar="CASE",
                          help=f"any of: {', '.join(cases).replace('%', '%%')} [all]")
 
     walkers = ["walker-walk", "walker-run"]
-    curve = {"steps": 5000, "evaluations": 4, "episodes": 5}
+    budget = {"steps": fac.DistillConfig.steps, "episodes": 10}
     shipped = [task for task in sorted(fac.TASKS) if (fac.EXPERTS / task / "expert.npz").exists()]
     add_cases("figure4", distil_and_time, FIGURE4, "Section 5.2: Fac-TDMPC, TD-MPC in Table 2's "
               "size and the small one of B.2, and TAP, by Algorithm 1; return against steps, then "
@@ -889,7 +841,7 @@ def make_parser():
               "consistency loss.", walkers)
     add_runs("departures", command_departures, "The differences in distillation one at a time, "
              "towards the paper's values.", ["reacher-hard", "walker-walk"],
-             steps=5000, evaluations=1, episodes=10)
+             **budget)
     for name, run, help, episodes in (
             ("figure7", command_figure7, "Section 5.4: samples and iterations, expert and student: "
              "returns, then milliseconds (keep the machine quiet for these).", 4),
@@ -948,16 +900,16 @@ def make_parser():
     sub.add_argument("--decisions", type=positive,
                      help="of training, a multiple of 2000 [30000; walker-walk: 48000]")
     add_runs("figure13", lambda args: distil_and_time(args, lambda task: [
-        (f"N = {n}", {"num_agents": n}) for n in range(1, fac.lookup_task(task)[1] + 1)
-        if fac.lookup_task(task)[1] % n == 0]),
+        (f"N = {n}", {"num_agents": n}) for n in range(1, fac.lookup_task(task)[1])
+        if fac.lookup_task(task)[1] % n == 0] + [("default", {})]),
              "Appendix C.2: the number of agents; returns, then milliseconds (keep the machine "
-             "quiet for these).", walkers, **curve)
+             "quiet for these).", walkers, **budget)
     for sub in map(commands.choices.get, ("capacity", "experts", "printed")):
         sub.add_argument("--students", default="runs", help="leave them in TASK-SEED-CASE/ [runs]")
     for sub in map(commands.choices.get, ("figure4", "figure7", "figure13")):
         sub.add_argument("--rounds", type=positive, default=20, help="timings of each [20]")
     sub = add_runs("sweep", command_sweep, "A grid over Algorithm 1's settings and num-agents.",
-                   ["reacher-hard"], steps=fac.DistillConfig.steps, evaluations=1, episodes=10)
+                   ["reacher-hard"], **budget)
     sub.add_argument("--set", nargs="+", action="extend", required=True, metavar="NAME=VALUE,...",
                      help="e.g. lr=1e-3,3e-4 batch-size=16,32; Algorithm 1's in distill --help")
     sub.add_argument("--scheduler", metavar="tcp://HOST:PORT", help="a dask cluster's, which makes "

@@ -307,7 +307,8 @@ def play_marks(task, seed, case, settings, folder, data):
                 q, g = ranks_of(student, load_path(task, data, "replay.npz"), about,
                                 planning.discount)
                 ranks = {"rank_q": float(q[0]), "rank_return": float(g[-1])}
-            yield {"step": step, **ranks, **experiments.measure(student, task, planning, episodes)}
+            yield {"step": step, **ranks, **experiments.of_returns(
+                experiments.returns_of(student, task, planning, episodes, 0), 0)}
 
 
 def ranks_of(student, replay, header, discount):

@@ -19,11 +19,6 @@ from tables import deviation, markdown, of_returns
 EVALUATION_SEEDS = (101, 102)  # which nothing was chosen by
 MEASURED = ("rank_correlation", "plan_ms", "same_search_returns",  # of a result, in a row
             "reflex_returns", "played", *fac.CHOSEN)
-KEPT, WINS = "kept by evaluation seed", "planning wins, expert / student"
-FASTER = "speed-up, one core: over expert / the same search"
-HEADS = ("seeds", "MPPI", "student", KEPT, "least kept", WINS,
-         "the same search with the expert: kept", FASTER,
-         "rank correlation of G, H = 0 / last", "minutes")
 FLAGS = {"samples": "plan-samples", "iterations": "plan-iterations"}
 
 
@@ -156,14 +151,9 @@ def kept(rows, key="returns"):
     return np.nan if found is None else found
 
 
-def wins(rows, key="returns", over="policy_returns"):
-    """What returns are above others in the same episodes: mean ± standard error over episodes and
-    over students, as if these were apart. rows: {evaluation seed: rows by seed}"""
-    return "{:.0f} ± {:.0f}".format(*difference(rows, key, over))
-
-
 def difference(rows, key="returns", over="policy_returns"):
-    """`wins`, its mean and its error."""
+    """What returns are above others in the same episodes: mean, and standard error over episodes
+    and over students, as if these were apart. rows: {evaluation seed: rows by seed}"""
     return mean_and_error(by_episode(rows, lambda row: np.subtract(returns(row, key),
                                                                    returns(row, over))))
 
@@ -174,7 +164,7 @@ def by_episode(rows, of=returns):
 
 
 def mean_and_error(found):
-    """Of values (students, episodes) the mean, and its error as in `wins`."""
+    """Of values (students, episodes) the mean, and its error as in `difference`."""
     errors = [x.std(ddof=1) / len(x) ** 0.5 for x in (found.mean(0), found.mean(1)) if len(x) > 1]
     return found.mean(), np.hypot.reduce(errors)
 
@@ -188,28 +178,6 @@ def ranks(rows):
     """The rank correlation of G of H = 0 and the last."""
     return " / ".join(f"{measured(rows, lambda x, h=h: x['rank_correlation_returns'][h]):.2f}"
                       for h in (0, -1))
-
-
-def cells(rows):
-    """A line's HEADS, of {evaluation seed: rows by seed}."""
-    if len(rows) < 2:
-        return ["-"] * len(HEADS)
-    first, students = rows[min(rows)], sum(rows.values(), [])
-    same = [row for row in students if returns(row, "same_search_returns")]
-    faster = (measured(of, lambda x, key=key: x[key]) /
-              measured(of, lambda x: x["plan_ms_student_in_process"])
-              for key, of in (("plan_ms_expert", first), ("plan_ms_same_search", same)) if of)
-    budget = " / ".join(dict.fromkeys(
-        "{samples} x {iterations}".format_map(json.loads(row["ranks"])) for row in first))
-    means = [float(row["return_mean"]) for row in first]
-    return [len(first), budget, mean_and_spread(means, deviation),
-            " / ".join(f"{kept(rows[seed]):.2f}" for seed in sorted(rows)),
-            f"{min(kept([row]) for row in students):.2f}",
-            " / ".join(wins(rows, key) for key in ("expert_returns", "returns"))
-            if all(returns(row, "policy_returns") for row in students) else "-",
-            f"{kept(same, 'same_search_returns'):.2f}" if same else "-",
-            " / ".join(f"{x:.1f}" for x in faster),
-            ranks(first), f"{np.mean([float(row['minutes']) for row in first]):.0f}"]
 
 
 def line_of(row):
@@ -228,42 +196,12 @@ def by_line(rows):
     return {line: found[line] for line in dict.fromkeys(map(line_of, rows))}
 
 
-def table(lines, authors):
-    """All lines, {line: {head: cell}}, and Markdown. lines: `by_line`'s; authors: {task: text}."""
-    result, last = {}, "authors' logs: 100% TD-MPC / Fac-TDMPC"
-    for line, found in lines.items():
-        row = sum(found.values(), [])[0]
-        policy = returns(row, "policy_returns")
-        result[line] = {
-            "task": line, "N": json.loads(row["settings"])["num_agents"],
-            "expert": mean_and_spread(returns(row, "expert_returns"), np.std),
-            "its policy alone": mean_and_spread(policy, np.std) if policy else "-",
-            **dict(zip(HEADS, cells(found))), last: authors.get(row["task"], "-")}
-    return result, markdown(["task", "N", "expert", "its policy alone", *HEADS, last],
-                            [found.values() for found in result.values()])
-
-
-def search_table(lines):
-    """The expert searching like its student, beside both: mean returns as the README's, and
-    milliseconds of a decision in one process."""
-    keys = "expert_returns", "policy_returns", "same_search_returns", "returns"
-    timed = "expert", "policy", "same_search", "student_in_process"
-    heads, found = ("the expert", "its policy alone", "the same search", "student"), []
-    for line, rows in lines.items():
-        own = sum(rows.values(), [])
-        if len(rows) > 1 and all(returns(row, key) for row in own for key in keys):
-            ms = (measured(own, lambda x, key=f"plan_ms_{who}": x[key]) for who in timed)
-            found.append([line, *(f"{overall(own, key):.0f}" for key in keys),
-                          wins(rows, over="same_search_returns"), *(f"{x:.1f}" for x in ms)])
-    return markdown(["task", *heads, "student - the same search", *(f"ms: {x}" for x in heads)],
-                    found)
-
-
-def alone_tables(lines):
+def alone_tables(lines, authors):
     """What each joint wins alone: the README's table, and all of it. Mean returns over students and
     episodes of all evaluation seeds: the expert, its policy alone, the student's priors alone, the
     student with the search that it chose by playing (it may be none), the expert in the same
-    search; ± `difference`'s error of the student's from the expert's."""
+    search; ± `difference`'s error of the student's from the expert's. authors: {task: returns
+    in the authors' logs, of Fac-TDMPC and of TD-MPC first}."""
     short, whole = [], []
     for line, rows in lines.items():
         own = sum(rows.values(), [])
@@ -285,11 +223,13 @@ def alone_tables(lines):
                       f"{ms[0] / ms[1]:.0f}"])
         whole.append([line, agents, len(about), expert, policy, reflex, student, same,
                       f"{kept(own):.2f} ± {error / overall(own, 'expert_returns'):.2f}", search,
-                      *(f"{x:.1f}" for x in ms)])
+                      *(f"{x:.1f}" for x in ms), ranks(own),
+                      " / ".join(map(str, authors.get(line, "-")[1::-1]))])
     return (markdown(["task, N", "expert", "its policy", "student", "times as fast"], short),
             markdown(["task", "N", "rows", "expert", "its policy alone", "priors alone", "student",
                       "expert, same search", "kept", "its search", "ms: expert",
-                      "ms: student"], whole))
+                      "ms: student", "rank of G, H = 0 / last",
+                      "authors' logs: TD-MPC / Fac-TDMPC"], whole))
 
 
 # ----------------------------------------------------------- one model for all joints beside N
@@ -409,3 +349,38 @@ def printed_table(lines):
                       ranks(own) if own[0]["ranks"] else "-"])
     return markdown(["task", "what searches", "students", "expert", "its policy", "return", "kept",
                      "rank of G, H = 0 / last"], found)
+
+
+# --------------------------------------------------------------------- one thing changed at a time
+
+def variants_table(lines, ms):
+    """Students of which one thing is changed, by a search around priors that know its plans and by
+    these alone; the search's return less the default students' in the same episodes. lines:
+    `by_line`'s; ms: {(task, case): milliseconds}. Result {task: {case: ...}}, Markdown, panels."""
+    result, found, panels, default = {}, [], {}, {}
+    for rows in lines.values():
+        first = rows[min(rows)]
+        task, case = first[0]["task"], first[0]["case"]
+        own, policy = by_episode(rows), by_episode(rows, lambda row: returns(row, "policy_returns"))
+        if case == "default":
+            default[task] = own
+        about = {"students": len(first), "search": own.mean(), "policy": policy.mean(),
+                 "above_default": mean_and_error(own - default[task])
+                 if own.shape == np.shape(default.get(task)) else None}
+        dots = panels.setdefault(task, {})[case] = {"its search": mean_and_error(own - policy)}
+        if all(returns(row, "reflex_returns") for row in first):
+            alone = by_episode(rows, lambda row: returns(row, "reflex_returns"))
+            about.update(priors=alone.mean(), search_wins=mean_and_error(own - alone))
+            dots["priors alone"] = mean_and_error(alone - policy)
+        h0, last = (np.mean([float(row[key] or "nan") for row in first])
+                    for key in ("rank_q", "rank_return"))
+        result.setdefault(task, {})[case] = about
+        above, wins = ("{:+.0f} ± {:.0f}".format(*of) if (of := about.get(key)) else "-"
+                       for key in ("above_default", "search_wins"))
+        found.append([task, case, len(first), f"{policy.mean():.0f}", f"{own.mean():.0f}", above,
+                      f"{about['priors']:.0f}" if "priors" in about else "-", wins,
+                      f"{h0:.2f} / {last:.2f}" if np.isfinite(last) else "-",
+                      f"{ms[task, case]:.1f}" if (task, case) in ms else "-"])
+    return result, markdown(["task", "students", "number", "policy", "its search",
+                             "less the default's", "priors alone", "search - priors",
+                             "rank of G, H = 0 / last", "ms"], found), panels

@@ -5,7 +5,6 @@ these returns (n). A ratio is one of means, never a mean of ratios.
 """
 import csv
 import itertools
-import json
 from pathlib import Path
 
 import numpy as np
@@ -103,17 +102,29 @@ def draw_lines(path, panels, xlabel, ylabel="episode return", **axes):
     plots.drawn(plots.save_figure, path, figure)
 
 
+def draw_dots(path, panels, xlabel):
+    """A panel each {title: {case: {label: (mean, error)}}}: a line for a case, a dot a label."""
+    plt = plots.pyplot()
+    rows = max(map(len, panels.values()))
+    figure, grid = plt.subplots(1, len(panels), squeeze=False, layout="constrained",
+                                figsize=(1 + 4.5 * len(panels), 1.5 + 0.28 * rows))
+    for ax, (title, cases) in zip(grid[0], panels.items()):
+        labels = list(dict.fromkeys(label for found in cases.values() for label in found))
+        for i, (label, style) in enumerate(zip(labels, plt.rcParams["axes.prop_cycle"])):
+            at = [y for y, found in enumerate(cases.values()) if label in found]
+            means, errors = zip(*(found[label] for found in cases.values() if label in found))
+            ax.errorbar(means, np.array(at) + 0.2 * (i - (len(labels) - 1) / 2), xerr=errors,
+                        fmt="os^"[i], color=style["color"], label=label)
+        ax.axvline(0, color="black", linewidth=0.8)
+        ax.set(title=title, xlabel=xlabel, yticks=range(len(cases)), yticklabels=cases)
+        ax.invert_yaxis()
+    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    plots.drawn(plots.save_figure, path, figure)
+
+
 # -------------------------------------------------------------------- Figure 7: equal return
 
 KEEPS = 0.95  # of a return: what is still as good
-
-
-def halves(row):
-    """Means of a run's even and odd episodes: one half a budget is chosen by, the other it is
-    reported on. Of a row that holds no episode's return (or one's) both are its mean."""
-    returns = json.loads(row["returns"] or "[]")
-    return ((np.mean(returns[::2]), np.mean(returns[1::2])) if len(returns) > 1
-            else (float(row["return_mean"]),) * 2)
 
 
 def cheapest(budgets, level, key):
@@ -179,62 +190,31 @@ def budget_cells(row):
 # --------------------------------------------------------- Figure 8: differences, intervals
 
 DRAWS = 4000  # of the bootstrap
-MAX_RETURN = 1000  # of an episode of dm_control
 
 
-def drawn_means(rows, episodes, luck):
-    """Means (DRAWS,), over seeds, of the drawn `episodes` (DRAWS, E) of runs. Of one whose row
-    holds no episode's return: its mean and `luck` (DRAWS,) of its standard errors."""
-    found = []
-    for row in rows:
-        returns = np.array(json.loads(row["returns"] or "[]"))
-        n = json.loads(row["settings"]).get("episodes", 1)
-        error = float(row["return_std"] or 0) / max(1, n - 1) ** 0.5
-        found.append(returns[episodes].mean(1) if len(returns) else
-                     float(row["return_mean"]) + luck * error)
-    return np.mean(found, 0)
+def kept_of(values, kind, joints):
+    """What is kept of the undisturbed return, a mean over joints, and DRAWS of a bootstrap over
+    episodes and joints. values: {(kind, joint): returns (students, episodes)}."""
+    rng = np.random.default_rng(0)  # the same draws for all that played the same
+    whole, *parts = (np.mean(values[key], 0) for key in (("none", 0), *((kind, j) for j in joints)))
+    episodes = rng.integers(len(whole), size=(DRAWS, len(whole)))
+    drawn = rng.integers(len(joints), size=(DRAWS, len(joints)))
+    means = np.mean(np.array(parts)[drawn[..., None], episodes[:, None]], (1, 2))
+    return np.mean(parts) / whole.mean(), means / whole[episodes].mean(1)
 
 
-def kept_difference(student, expert, kind, joints):
-    """What student and expert keep of their undisturbed return, mean over joints; the difference,
-    and where 95% of a bootstrap over episodes and joints lie (low, high).
-
-    student, expert: {(kind, joint): rows}. Both play the same episodes, so these are drawn for
-    both. Where rows hold no episode's return, a model's luck is the same for all joints: as wide
-    as it can be. None where there is nothing to keep."""
-    rng = np.random.default_rng(0)
-    count = json.loads(student["none", 0][0]["settings"]).get("episodes", 1)
-    episodes = rng.integers(count, size=(DRAWS, count))
-    drawn = rng.integers(len(joints), size=(len(joints), DRAWS))
-    kept, draws = [], []
-    for rows in (student, expert):
-        whole, *parts = (np.mean([float(row["return_mean"]) for row in rows[key]])
-                         for key in (("none", 0), *((kind, joint) for joint in joints)))
-        kept.append(fac.return_kept(np.mean(parts), whole))
-        luck = rng.standard_normal((2, DRAWS))
-        whole = np.clip(drawn_means(rows["none", 0], episodes, luck[0]), 1, MAX_RETURN)
-        parts = np.clip([drawn_means(rows[kind, joint], episodes, luck[1]) for joint in joints],
-                        0, MAX_RETURN)
-        draws.append(np.take_along_axis(parts, drawn, 0).mean(0) / whole)
-    if None in kept:
-        return None
-    low, high = np.percentile(draws[0] - draws[1], (2.5, 97.5)).tolist()
-    return {"student": kept[0], "expert": kept[1], "difference": kept[0] - kept[1],
-            "low": low, "high": high}
-
-
-def kept_cell(found):
-    """Both, the difference and its interval; bold if that leaves out 0."""
-    if found is None:
-        return "-"
-    text = "{student:.2f} / {expert:.2f}, {difference:+.2f} ({low:+.2f} to {high:+.2f})".format(
-        **{key: round(x, 2) + 0.0 for key, x in found.items()})  # no -0.00
-    return f"**{text}**" if found["low"] > 0 or found["high"] < 0 else text
+def difference_cell(one, other):
+    """What one keeps less what another does and where 95% of draws lie (low to high); bold if that
+    leaves out 0. Both: `kept_of`'s, of as many episodes."""
+    low, high = np.percentile(one[1] - other[1], (2.5, 97.5))
+    mean, low, high = (round(float(x), 2) + 0.0 for x in (one[0] - other[0], low, high))  # no -0.00
+    text = f"{mean:+.2f} ({low:+.2f} to {high:+.2f})"
+    return f"**{text}**" if low > 0 or high < 0 else text
 
 
 def draw_bars(path, cells, kinds):
     """Bars of the return with each action dimension disturbed, {task: {case: {(kind, joint):
-    [values]}}}; lines across: undisturbed, ("none", 0)."""
+    returns}}}; lines across: undisturbed, ("none", 0)."""
     plt = plots.pyplot()
     figure, grid = plt.subplots(len(cells), len(kinds), squeeze=False, layout="constrained",
                                 figsize=(11, 2.8 * len(cells)), sharey="row")
@@ -243,11 +223,11 @@ def draw_bars(path, cells, kinds):
         for ax, kind in zip(row, kinds):
             for i, (case, values) in enumerate(sorted(cases.items())):
                 joints = sorted(j for k, j in values if k == kind)
-                ax.bar(np.array(joints) + 0.4 * i - 0.2,
-                       [np.mean(values[kind, j]) for j in joints], 0.38, label=case,
-                       color=f"C{i}", hatch=("", "//")[i % 2], edgecolor="black")
-                if ("none", 0) in values:
-                    ax.axhline(np.mean(values["none", 0]), color=f"C{i}", linestyle=("-", "--")[i])
+                ax.bar(np.array(joints) + 0.27 * (i - 1),
+                       [np.mean(values[kind, j]) for j in joints], 0.25, label=case,
+                       color=f"C{i}", hatch=("", "//", "..")[i], edgecolor="black")
+                ax.axhline(np.mean(values["none", 0]), color=f"C{i}",
+                           linestyle=("-", "--", ":")[i])
             what = "one action is noise" if kind == "noise" else f"one motor x {kind}"
             ax.set(title=f"{task}: {what}", xlabel="action dimension", ylabel="episode return",
                    xticks=range(0, actions, 1 + actions // 20))

@@ -177,7 +177,7 @@ def test_a_killed_sweep_goes_on_and_makes_no_run_twice(tmp_path):
     result = last_json(run(*flags, "--json", cwd=tmp_path))
     assert result == {"out": "sweep.csv", "runs": 4, "now": 4 - len(before), "failed": 0}
     after = rows_of(path)
-    assert len(after) == 4 and all(len(rows) == 1 for rows in after.values())
+    assert len(after) == 4 and all(len(rows) == 2 for rows in after.values())
     assert {k: after[k] for k in before} == before
     result = last_json(here(*flags, "--json", cwd=tmp_path))
     assert result["now"] == 0 and rows_of(path) == after
@@ -191,7 +191,7 @@ def test_a_failed_run_is_a_row_and_is_tried_again(tmp_path):
         assert json.loads(done.stdout.splitlines()[-1])["failed"] == 1
     rows = experiments.read_rows(tmp_path / "sweep.csv")
     assert ["allocate" in row["error"] for row in rows].count(True) == 2
-    assert len(rows) == 3 and len(rows_of(tmp_path / "sweep.csv")) == 1
+    assert len(rows) == 4 and len(rows_of(tmp_path / "sweep.csv")) == 1
 
 
 def seven_but_one_dies(task, seed, case, settings):
@@ -237,7 +237,7 @@ def test_a_run_that_does_not_fit_its_figure_is_refused_before_the_work(tmp_path)
     write_rows(tmp_path / "4.csv", [("walker-run", 0, "TAP", {"steps": 3}, [{"minutes": 1.0}])])
     before = (tmp_path / "4.csv").read_bytes()
     refused(here("figure4", "--tasks", "walker-run", "--out", "4.csv", cwd=tmp_path), "4.csv: TAP",
-            "'steps': 3", "'steps': 5000", "--out")
+            "'steps': 3", "'steps': 7000", "--out")
     assert (tmp_path / "4.csv").read_bytes() == before
 
 
@@ -387,7 +387,8 @@ def short_episodes(monkeypatch):
 
 
 def test_every_method_of_figure_4_learns_and_plans(monkeypatch):
-    """Rows at each evaluation; 10% TD-MPC has few weights; TAP plans latent actions."""
+    """A row for each evaluation seed; 10% TD-MPC has few weights; TAP plans latent actions, which
+    no prior knows."""
     weights = {}
     short_episodes(monkeypatch)
     for case, settings in experiments.FIGURE4.items():
@@ -401,17 +402,21 @@ def test_every_method_of_figure_4_learns_and_plans(monkeypatch):
         weights[case] = sum(v.size for k, v in distiller.student.params.items()
                             if k.startswith(("_dynamics", "_reward", "_Q")))
         rows = list(experiments.distil("cheetah-run", 0, case, {
-            **settings, "steps": 4, "evaluations": 2, "episodes": 1, "samples": 4,
-            "iterations": 1, "expert_episodes": 0, "batch_size": 2}))
-        assert [row["step"] for row in rows] == [2, 4] and rows[-1]["return_mean"] >= 0
-    assert 0.02 < weights["10% TD-MPC"] / weights["100% TD-MPC"] < 0.04
+            **settings, "steps": 4, "episodes": 1, "samples": 4, "iterations": 1,
+            "expert_episodes": 0, "batch_size": 2}))
+        assert [row["evaluation_seed"] for row in rows] == [101, 102]
+        assert all(row["step"] == 4 and row["return_mean"] >= 0 for row in rows)
+        assert all(len(row["policy_returns"]) == 1 for row in rows)
+        assert all((case == "TAP") == (not row["ranks"]) for row in rows)
+    assert 0.02 < weights["10% TD-MPC"] / weights["N = 1"] < 0.04
 
 
 def test_a_run_is_distilled_as_it_says(monkeypatch):
     seen, made = [], []
 
     def play(model, task, planning, seeds, *_):
-        seen.append((model.config.num_agents, planning.horizon, planning.samples, seeds))
+        seen.append((model.config.num_agents, planning.horizon, planning.samples * (
+            planning.iterations > 0), seeds))
         return [np.zeros((len(seeds), fac.EPISODE_STEPS, *shape)) for shape in ((17,), (6,), ())]
 
     untaught_priors(monkeypatch)
@@ -419,13 +424,15 @@ def test_a_run_is_distilled_as_it_says(monkeypatch):
     monkeypatch.setattr(fac.Distiller, "ranks", lambda *_: (np.arange(3), np.arange(4, 7)))
     monkeypatch.setattr(experiments, "distiller_of", lambda case: lambda *args: (
         made.append(args[3:]), fac.Distiller(*args))[1])
-    (row,) = experiments.distil("cheetah-run", 5, "x", {
+    rows = list(experiments.distil("cheetah-run", 5, "x", {
         "num_agents": 3, "steps": 4, "batch_size": 2, "horizon": 2, "expert_episodes": 3,
-        "samples": 7, "iterations": 1})
-    (*_, played), (*last, evaluated) = seen
-    assert made == [(3, 5)] and last == [3, 2, 7] and evaluated == fac.episode_seeds(0, 10)
-    assert played == fac.training_seeds(5, "expert episode", 0, 3)
-    assert (row["rank_q"], row["rank_return"]) == (0, 6)
+        "samples": 7, "iterations": 1}))
+    (*_, played), *evaluated = seen
+    assert made == [(3, 5)] and played == fac.training_seeds(5, "expert episode", 0, 3)
+    assert sorted(evaluated) == [
+        (agents, horizon, samples, fac.episode_seeds(seed, 10)) for agents, horizon, samples in
+        ((1, 3, 0), (3, 2, 0), (3, 2, 7)) for seed in (101, 102)]  # policy, priors, search
+    assert [(row["rank_q"], row["rank_return"]) for row in rows] == [(0, 6)] * 2
 
 
 @pytest.mark.parametrize("case, settings, prior", [
@@ -434,12 +441,14 @@ def test_a_run_is_distilled_as_it_says(monkeypatch):
 def test_a_departure_s_student_searches_around_its_priors_but_for_d9(monkeypatch, case, settings,
                                                                     prior):
     planned = []
-    monkeypatch.setattr(experiments, "measure", lambda model, task, planning, *_: (
-        planned.append(planning.prior), fac.Planner(model, planning).close(), {})[2])
+    monkeypatch.setattr(experiments, "returns_of", lambda model, task, planning, *_: (
+        planned.append((model.config.num_agents, planning.prior, planning.iterations)),
+        fac.Planner(model, planning).close(), np.zeros(1))[2])
     monkeypatch.setattr(fac.Distiller, "ranks", lambda *_: (np.arange(3), np.arange(3)))
     list(experiments.distil("cheetah-run", 0, case, {
         **settings, "steps": 1, "batch_size": 2, "expert_episodes": 0}))
-    assert planned == [prior]
+    reflex = [(6, "own", 0)] * (prior == "own")
+    assert planned == [*reflex, (6, prior, 3 if prior == "own" else 4), (1, "own", 0)] * 2
 
 
 def test_every_method_of_figure_4_learns_from_its_run_s_seed(replay, monkeypatch):
@@ -455,16 +464,17 @@ def test_every_method_of_figure_4_learns_from_its_run_s_seed(replay, monkeypatch
             assert distiller.seed == seed
         assert np.array_equal(weights[0], weights[1]), case
         assert not np.array_equal(weights[0], weights[2]), case
-        hidden = {"Fac-TDMPC": 170, "10% TD-MPC": 66}.get(case, 512)  # 512 // 3; B.2's; Table 2's
+        hidden = {"default": 170, "10% TD-MPC": 66}.get(case, 512)  # 512 // 3; B.2's; Table 2's
         assert distiller.student.config.mlp_dim == hidden, case
 
 
 def test_a_row_holds_the_mean_and_the_least_of_its_returns(monkeypatch):
     rewards, seen = np.array([[1.0, 2.0], [0.0, 9.0], [5.0, 1.0], [0.0, 0.5]]), []
     monkeypatch.setattr(fac, "play", lambda *args: (seen.append(args[3]), (0, 0, rewards, 0))[1])
-    found = experiments.measure(None, "x", None, 4)
+    returns = experiments.returns_of(None, "x", None, 4, 101)
+    found = tables.of_returns(returns, 101)
     assert (found["return_mean"], found["return_min"]) == (4.625, 0.5)  # of 3, 9, 6 and 0.5
-    assert seen == [fac.episode_seeds(0, 4)]
+    assert found["returns"] == [3, 9, 6, 0.5] and seen == [fac.episode_seeds(101, 4)]
 
 
 def loss_inputs(dtype=np.float64):
@@ -676,13 +686,18 @@ def test_figure_8_s_noise_is_a_standard_normal_cut_at_the_limits(monkeypatch):
 
 def test_a_run_is_planned_disturbed_and_timed_as_it_says(monkeypatch, tmp_path):
     seen, made, planner = [], [], fac.Planner
-    monkeypatch.setattr(experiments, "measure", lambda *args: seen.append(args) or {})
+    monkeypatch.setattr(experiments, "returns_of", lambda *args: seen.append(args) or [1.0])
     fac.save_model(tmp_path / "reacher-hard-0" / "student.npz", random_model(), {"kind": "student"})
     list(experiments.plan_with("reacher-hard", 0, "student", {
         "samples": 7, "iterations": 2, "episodes": 3, "joint": 1, "kind": "noise",
         **experiments.identity(random_model(), {})}, tmp_path))
-    ((_, _, planning, count, environment),) = seen
-    assert (planning.samples, planning.iterations, count, environment._joint) == (7, 2, 3, 1)
+    for (_, _, planning, count, of, environment), evaluation_seed in zip(seen, (101, 102)):
+        assert (planning.samples, planning.iterations, count, of, environment._joint) == (
+            7, 2, 3, evaluation_seed, 1)
+    expert, header = fac.load_model(fac.data_file("reacher-hard", "expert.npz"))
+    list(experiments.plan_with("reacher-hard", 0, "policy", {
+        "episodes": 3, **experiments.identity(expert, header)}, tmp_path))
+    assert (seen[-1][2].prior, seen[-1][2].iterations) == ("own", 0)
     monkeypatch.setattr(fac, "Planner", lambda model, config, **how: (
         made.append(config.samples), planner(model, config, **how))[1])
     (row,) = experiments.time_runs([experiments.make_run("x", 0, "expert", samples=7)],
@@ -717,13 +732,14 @@ def test_figures_7_and_8_plan_with_both_models(tmp_path, monkeypatch, capsys):
     for _ in range(2):  # nothing is missing the second time
         assert experiments.main(["figure7", *flags, "--rounds", "2", "--out", "7.csv"]) == 0
         rows = experiments.read_rows("7.csv")
-        assert len(rows) == 8 and [bool(row["ms"]) for row in rows] == [False] * 4 + [True] * 4
+        assert len(rows) == 12 and [bool(row["ms"]) for row in rows] == [False] * 8 + [True] * 4
     assert {row["case"] for row in rows} == {"expert", "student"}
     seen = []  # who plays is the same for figure 8
     monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: seen.extend(runs))
     assert experiments.main(["figure8", *flags]) == 0
-    assert len(seen) == 2 * (1 + 3 * 3)
-    row = runs.attempt(functools.partial(experiments.plan_with, students="runs"), {
+    assert len(seen) == 3 * (1 + 3 * 3)
+    assert {run["case"] for run in seen} == {"expert", "policy", "student"}
+    row = runs.attempt(functools.partial(experiments.plan_with, folder="runs"), {
         **seen[-1], "settings": seen[-1]["settings"].replace("weights ", "weights 1")})[-1]
     assert row["error"] == ("UserError: student of reacher-hard, seed 0, in data/ or runs/, has "
                             "changed; give the command again")
@@ -827,16 +843,39 @@ def test_runs_of_other_settings_don_t_make_one_figure(tmp_path, capsys, case, se
     assert "walker-run is of other data or defaults than now" in capsys.readouterr().err
 
 
+def variant_row(evaluation_seed, search, priors=None, policy=(10.0, 30.0), **more):
+    """A row as `distil` makes it."""
+    return {"step": 9, **tables.of_returns(search, evaluation_seed), "minutes": 1.0,
+            "policy_returns": policy, "rank_q": 0.9, "rank_return": 0.5,
+            "ranks": {"reflex_returns": priors} if priors else {}, **more}
+
+
 def test_a_report_needs_no_expert(tmp_path, monkeypatch):
-    rows = [{"step": 1, "return_mean": 7.0, "minutes": 1.0}]
-    write_rows(tmp_path / "figure4.csv", [("walker-run", 0, "TAP", {"data": [1]}, rows)])
+    """What a change costs is of the same episodes and seeds; TAP has no priors and no ranks."""
+    write_rows(path := tmp_path / "variants.csv", [
+        *(("walker-stand", seed, case, {"data": [1]}, [
+            variant_row(102, [40.0 + seed - less, 60.0], [10.0, 20.0]),
+            variant_row(101, [50.0 - less, 70.0 + seed], [20.0, 30.0])])
+          for case, less in (("default", 0), ("MSE", 8)) for seed in (0, 1)),
+        ("walker-stand", 0, "TAP", {"data": [1]}, [
+            variant_row(101, [1.0, 2.0], rank_q="", rank_return=""),
+            variant_row(102, [3.0, 4.0], rank_q="", rank_return="")]),
+        ("walker-stand", 0, "default", {"data": [1]}, [{"ms": 2.5, "ms_workers": 1.0}])])
     monkeypatch.setattr(fac, "EXPERTS", tmp_path)
-    monkeypatch.setattr(experiments, "draw_lines", lambda *_, **__: None)
-    result, table = experiments.report_curves("figure4", tmp_path / "figure4.csv", tmp_path)
-    assert result["walker-run"]["TAP"]["mean"] == 7 and "| walker-run | 7 | - |" in table
-    write_rows(path := tmp_path / "other.csv", [("walker-stand", 0, "TAP", {"data": [1]}, rows)])
-    _, table = experiments.report_curves("figure4", path, tmp_path)  # not one of the paper's
-    assert "| walker-stand | 7 | - | - |" in table
+    monkeypatch.setattr(experiments, "draw_dots", lambda path, panels, _: drawn.update(panels))
+    drawn = {}
+    result, text = experiments.report_variants("variants", path, tmp_path)
+    default, mse, tap = ([cell.strip() for cell in line.split("|")[1:-1]]
+                         for line in text.splitlines()[2:])
+    assert default == ["walker-stand", "default", "2", "20", "55", "+0 ± 0", "20",
+                       "+35 ± 3", "0.90 / 0.50", "2.5"]
+    # -8, 0, -8, 0 in both seeds: a standard error of 2.3 over episodes, none over seeds
+    assert mse[3:7] == ["20", "51", "-4 ± 2", "20"] and mse[-1] == "-"
+    assert tap == ["walker-stand", "TAP", "1", "20", "2", "-", "-", "-", "-", "-"]
+    assert result["walker-stand"]["MSE"]["above_default"] == pytest.approx((-4, (64 / 12) ** 0.5))
+    assert {case: [*dots] for case, dots in drawn["walker-stand"].items()} == {
+        "default": ["its search", "priors alone"], "MSE": ["its search", "priors alone"],
+        "TAP": ["its search"]}
 
 
 def test_what_a_student_was_made_with_tells_it_apart():
@@ -879,22 +918,22 @@ def test_a_csv_without_a_row_is_begun_anew(tmp_path, left):
 
 
 @pytest.mark.parametrize("command, cases, timed", [
-    (["figure13"], ["N = 1", "N = 3"], ["N = 1", "N = 3"]),
-    (["figure4", "--cases", "10% TD-MPC", "Fac-TDMPC", "TAP"], ["10% TD-MPC", "Fac-TDMPC", "TAP"],
-     ["10% TD-MPC", "Fac-TDMPC"])])
+    (["figure13"], ["N = 1", "default"], ["N = 1", "default"]),
+    (["figure4", "--cases", "10% TD-MPC", "default", "TAP"], ["10% TD-MPC", "default", "TAP"],
+     ["10% TD-MPC", "default"])])
 def test_figures_4_and_13_distil_and_time_their_cases(tmp_path, monkeypatch, command, cases, timed):
     monkeypatch.chdir(tmp_path)
     short_episodes(monkeypatch)  # in this process
     monkeypatch.setattr(runs, "in_processes", lambda function, own, jobs: (
         runs.attempt(function, run) for run in own))
     flags = ["--tasks", "reacher-easy", "--seeds", "0", "1", "--jobs", "1", "--steps", "1",
-             "--episodes", "1", "--evaluations", "1", "--samples", "4", "--iterations", "1",
-             "--rounds", "2"]
+             "--episodes", "1", "--samples", "4", "--iterations", "1", "--rounds", "2"]
     for _ in range(2):  # nothing is missing the second time
         assert experiments.main([*command, *flags, "--out", "rows.csv"]) == 0
         rows = experiments.read_rows("rows.csv")
-        assert [row["case"] for row in rows] == cases * 2 + timed
-        assert [bool(row["ms"]) for row in rows] == [False] * 2 * len(cases) + [True] * len(timed)
+        assert [row["case"] for row in rows] == [
+            case for case in cases * 2 for _ in (101, 102)] + timed
+        assert [bool(row["ms"]) for row in rows] == [False] * 4 * len(cases) + [True] * len(timed)
 
 
 def write_rows(path, runs):
@@ -911,12 +950,12 @@ def test_figure_7_judges_means_and_draws_along_its_axes(tmp_path, monkeypatch):
     found = ((512, 6, (100.0, 100.0), 8.0), (64, 6, (60.0, 100.0), 4.0),
              (512, 2, (96.0, 96.0), 6.0))
     write_rows(tmp_path / "7.csv", [("walker-run", seed, case, {"samples": s, "iterations": i}, [
-        {"return_mean": value[seed], "minutes": 1.0}, {"ms": ms, "ms_workers": ms}])
+        {"return_mean": value[seed], "returns": [value[seed]] * 2, "minutes": 1.0},
+        {"ms": ms, "ms_workers": ms}])
         for seed in (0, 1) for case in ("expert", "student") for s, i, value, ms in found])
-    (row,), table = experiments.report_figure7("", tmp_path / "7.csv", tmp_path)
+    (row,), _ = experiments.report_figure7("", tmp_path / "7.csv", tmp_path)
     assert row["expert"] == {"samples": 512, "iterations": 2, "ms": 6, "return": 96}
     assert [set(lines["expert"]) for lines, _ in drawn.values()] == [{512, 64}, {6, 2}]
-    assert "chosen by the episodes that they are reported on" in table
 
 
 def test_figure_7_compares_at_equal_return_on_episodes_that_chose_nothing(tmp_path, monkeypatch):
@@ -928,7 +967,8 @@ def test_figure_7_compares_at_equal_return_on_episodes_that_chose_nothing(tmp_pa
              "student": {(512, 6): ([60, 50] * 2, 8.0), (128, 4): ([60, 48] * 2, 5.0),
                          (64, 1): ([57, 33] * 2, 2.0), (16, 1): ([56, 90] * 2, 0.5)}}
     write_rows(tmp_path / "7.csv", [("walker-run", 0, case, {"samples": s, "iterations": i}, [
-        {"return_mean": np.mean(returns), "returns": returns, "minutes": 1.0},
+        {"return_mean": np.mean(returns), "returns": returns[:2], "evaluation_seed": 101},
+        {"return_mean": np.mean(returns), "returns": returns[2:], "minutes": 1.0},
         {"ms": ms, "ms_workers": 2 * ms}])
         for case, budgets in found.items() for (s, i), (returns, ms) in budgets.items()])
     (row,), table = experiments.report_figure7("", tmp_path / "7.csv", tmp_path)
@@ -939,45 +979,30 @@ def test_figure_7_compares_at_equal_return_on_episodes_that_chose_nothing(tmp_pa
     assert (row["ratio"], equal["ratio"]) == (5.0, 0.5)
     assert row["kept"] == {"512 x 6": 55 / 101, "128 x 4": 54 / 86}
     assert row["speedup"] == {"512 x 6": [2.5, 2.5], "128 x 4": [2.0, 2.0]}
-    assert "16 x 1: 66, 1.0 ms | 64 x 1: 33, 2.0 ms" in table and "every other episode" in table
-
-
-def figure8_rows(returns, keep_each=True):
-    """{(kind, joint): rows} of {(kind, joint): episodes' returns}, as a CSV holds them."""
-    return {key: [{"returns": json.dumps(own) if keep_each else "", "return_mean": np.mean(own),
-                   "return_std": np.std(own), "settings": json.dumps({"episodes": len(own)})}]
-            for key, own in returns.items()}
+    assert "16 x 1: 66, 1.0 ms | 64 x 1: 33, 2.0 ms" in table
 
 
 def test_an_interval_is_as_wide_as_episodes_and_joints_scatter():
-    def kept(student, expert, keep_each=True):
-        return tables.kept_difference(*(figure8_rows(found, keep_each)
-                                        for found in (student, expert)), "noise", [0, 1])
+    def kept(one, other):
+        parts = [tables.kept_of({key: [own] for key, own in found.items()}, "noise", [0, 1])
+                 for found in (one, other)]
+        return parts[0][0], tables.difference_cell(*parts), np.percentile(
+            parts[0][1] - parts[1][1], (2.5, 97.5))
 
     steady = {("none", 0): [100.0] * 5, ("noise", 0): [60.0] * 5, ("noise", 1): [60.0] * 5}
     better = {**steady, ("noise", 0): [70.0] * 5, ("noise", 1): [70.0] * 5}
-    found = kept(better, steady)
-    assert found == pytest.approx({"student": 0.7, "expert": 0.6, "difference": 0.1, "low": 0.1,
-                                   "high": 0.1})
-    assert tables.kept_cell(found) == "**0.70 / 0.60, +0.10 (+0.10 to +0.10)**"
-    assert tables.kept_cell(kept(steady, better)) == "**0.60 / 0.70, -0.10 (-0.10 to -0.10)**"
-    one = kept({**steady, ("noise", 0): [80.0] * 5}, steady)  # joints scatter: 0, 0.1 or 0.2
-    assert (one["low"], one["high"]) == pytest.approx((0, 0.2)) and "*" not in tables.kept_cell(one)
+    assert kept(better, steady)[:2] == (0.7, "**+0.10 (+0.10 to +0.10)**")
+    assert kept(steady, better)[:2] == (0.6, "**-0.10 (-0.10 to -0.10)**")
+    _, text, interval = kept({**steady, ("noise", 0): [80.0] * 5}, steady)  # joints: 0, 0.1, 0.2
+    assert interval == pytest.approx((0, 0.2)) and "*" not in text
     lucky = {**steady, ("noise", 0): [20.0, 100, 20, 100, 60], ("noise", 1): [100, 20, 60, 60, 60]}
-    same = kept(lucky, lucky)  # the same episodes are drawn for both
-    assert same["low"] == same["high"] == 0
-    episodes = kept(lucky, steady)
-    assert episodes["difference"] == 0 and -0.4 < episodes["low"] < -0.1 < 0.1 < episodes["high"]
-    blind = kept({**steady, ("noise", 0): [20.0, 100, 20, 100, 60], ("noise", 1): [
-        20.0, 100, 20, 100, 60]}, steady, keep_each=False)
-    error = np.std([20, 100, 20, 100, 60], ddof=1) / 5 ** 0.5 / 100  # shared by both joints
-    assert blind["high"] == pytest.approx(1.96 * error, rel=0.1) == -blind["low"]
-    whole = kept({**steady, ("none", 0): [90.0, 110, 90, 110, 100], ("noise", 0): [
-        90.0, 110, 90, 110, 100], ("noise", 1): [90.0, 110, 90, 110, 100]}, steady, keep_each=False)
-    error = 2 ** 0.5 * np.std([90, 110, 90, 110, 100], ddof=1) / 5 ** 0.5 / 100  # two lucks
-    assert whole["high"] - whole["low"] == pytest.approx(2 * 1.96 * error, rel=0.1)
-    assert kept(steady, {**steady, ("none", 0): [0.0] * 5}) is None
-    assert tables.kept_cell(None) == "-"
+    assert kept(lucky, lucky)[2].tolist() == [0, 0]  # the same episodes are drawn for both
+    mean, _, (low, high) = kept(lucky, steady)
+    assert mean == 0.6 and -0.4 < low < -0.1 < 0.1 < high < 0.4
+    # students: their mean is an episode's
+    one, _ = tables.kept_of({key: [[90.0] * 3, [110.0] * 3] if key[0] == "none" else [
+        [30.0] * 3, [50.0] * 3] for key in steady}, "noise", [0, 1])
+    assert one == 0.4
 
 
 def test_bands_over_seeds_are_sample_deviations(monkeypatch, tmp_path):
@@ -993,7 +1018,7 @@ def test_bands_over_seeds_are_sample_deviations(monkeypatch, tmp_path):
 
 
 def test_tables_hold_where_curves_end():
-    assert experiments.last({1: [1.0], 2: [3.0, 5.0]}, {1: [0.1], 2: [0.5, 0.25]}) == {
+    assert tables.last({1: [1.0], 2: [3.0, 5.0]}, {1: [0.1], 2: [0.5, 0.25]}) == {
         "mean": 4, "std": 2 ** 0.5, "seeds": 2, "rank_return": 0.375}
     own = [{"step": str(i), "return_mean": value, "expert_mean": "10"}
            for i, value in enumerate(("1", "9"))]
@@ -1001,140 +1026,47 @@ def test_tables_hold_where_curves_end():
     assert experiments.follow_up(runs, "walker-walk")[0] == 0.9
     runs["walker-walk", "1", "online", "{}"] = [{"step": "1", "return_mean": 9, "expert_mean": 2}]
     assert experiments.follow_up(runs, "walker-walk")[0] == 18 / 12  # of means
-    records = fac.read_records(fac.data_file("walker-run", "expert.npz"))
-    returns = max((returns for returns, _ in records.values()), key=len)
-    level = experiments.expert_level("walker-run", [("walker-run", "0", "x", '{"episodes": 2}')])
-    assert level == np.mean(returns[:2]) != np.mean(returns)
-    assert experiments.expert_level("walker-run", [
-        ("walker-run", "0", "x", '{"data": [1, 2, "walker-run"], "episodes": 2}')]) is None
 
 
 def test_report_draws_what_the_csvs_hold(tmp_path):
     pytest.importorskip("matplotlib")
-    for name, cases in (("figure4", experiments.FIGURE4), ("figure5", {"default": {}, "MSE": {}}),
-                        ("figure13", {"N = 1": {}})):  # whichever ended first
-        write_rows(tmp_path / f"{name}.csv", [
-            ("walker-run", seed, case, {}, [{"step": 5, "return_mean": 1.0},
-                                            {"step": 10, "return_mean": 10.0 + seed,
-                                             "minutes": 1.0}])
-            for case in cases for seed in (0, 2)] + [
-            ("walker-run", 2, "N = 1", {}, [{"ms": 8.0, "ms_workers": 5.0}])
-            for _ in range(name == "figure13")] + [
-            ("walker-run", 1, "TAP", {}, [{"error": "no"}])])
+    write_rows(tmp_path / "variants.csv", [
+        ("walker-run", seed, case, {}, [variant_row(101, [10.0 + seed, 20.0], [9.0, 9.0]),
+                                        variant_row(102, [30.0, 40.0], [9.0, 9.0])])
+        for case in ("default", "MSE", "N = 1") for seed in (0, 2)] + [
+        ("walker-run", 2, "N = 1", {}, [{"ms": 8.0, "ms_workers": 5.0}]),
+        ("walker-run", 1, "TAP", {}, [{"error": "no"}])])
     write_rows(tmp_path / "figure12.csv", [("walker-walk", 0, "online", {}, [
         {"step": 4, "return_mean": 5.0, "expert_mean": 6.0, "minutes": 1.0}])])
     write_rows(tmp_path / "figure8.csv", [("walker-run", 0, case, about, [
-        {"return_mean": value, "minutes": 1.0}]) for case in ("expert", "student")
-        for about, value in (({}, 9.0), *(({"joint": j, "kind": kind}, 4.0 + 2 * j)
+        {"return_mean": value, "returns": [value], "minutes": 1.0},
+        {"return_mean": value, "returns": [value]}]) for case in ("expert", "policy", "student")
+        for about, value in (({}, 9.0), *(({"joint": j, "kind": kind}, 3.5 + 2 * j)
                                           for j in (0, 1) for kind in ("noise", "0.5", "1.5")))])
-    write_student_rows(tmp_path / "students.csv")
     write_rows(tmp_path / "figure7.csv", [("walker-run", 0, case, {"samples": s, "iterations": i}, [
-        {"return_mean": value, "minutes": 1.0}, {"ms": ms, "ms_workers": ms / 2}])
+        {"return_mean": value, "returns": [value] * 2, "minutes": 1.0},
+        {"ms": ms, "ms_workers": ms / 2}])
         for case in ("expert", "student")
         for s, i, value, ms in ((512, 6, 100.0, 80.0), (64, 6, 96.0, 12.0), (64, 2, 94.0, 6.0),
                                 (16, 6, 97.0 * (case == "student"), 4.0))])
     found = last_json(here("report", "--results", ".", "--figures", "pictures", "--json",
                            cwd=tmp_path))
-    last = {"mean": 11.0, "std": 2 ** 0.5, "seeds": 2}
-    level = found["figure4"]["walker-run"].pop("expert_recorded")
-    records = fac.read_records(fac.data_file("walker-run", "expert.npz"))
-    assert level in [np.mean(returns) for returns, _ in records.values()]
-    assert found["figure5"]["walker-run"].pop("expert_recorded") == level
-    assert found["figure4"]["walker-run"] == dict.fromkeys(experiments.FIGURE4, last)
-    assert found["figure5"]["walker-run"] == {"default": last, "MSE": last}
-    assert found["figure13"]["walker-run"]["N = 1"] == {**last, "ms": 8.0, "ms_workers": 5.0}
+    assert found["variants"]["walker-run"]["N = 1"]["search"] == 25.25
     assert found["figure12"]["walker-walk"]["expert"]["mean"] == 6.0
     assert found["figure12"]["walker-walk"]["ratio"] == 5 / 6
-    assert found["figure8"]["walker-run"]["student"] == {"none": 9.0, "noise": 5.0, "0.5": 5.0,
-                                                         "1.5": 5.0}
+    assert found["figure8"]["walker-run"]["student"] == {"noise": 0.5, "0.5": 0.5, "1.5": 0.5}
     (row,) = found["figure7"]
     assert row["task"] == "walker-run" and row["ratio"] == 6.0 and row["ratio_in_process"] == 3.0
     assert row["expert"] == {"samples": 64, "iterations": 6, "ms": 12.0, "return": 96.0}
     assert row["student"] == {"samples": 16, "iterations": 6, "ms": 2.0, "return": 97.0}
-    assert [*found.pop("students")][:2] == ["walker-run", "walker-run, paper"]
     assert sorted(os.listdir(tmp_path / "pictures")) == sorted(f"{k}.png" for k in found)
     text = (tmp_path / "report.md").read_text(encoding="utf-8")
-    for part in ("## Figure 13", "809 / 836 / 697 / 560", "11 ± 1 (2)", "pictures/figure7.png"):
+    for part in ("## Figure 12", "| N = 1 | 2 | 20 | 25 | +0 ± 0 |", "pictures/figure7.png",
+                 "| student - policy |  | +0.00 (+0.00 to +0.00) |"):
         assert part in text
 
 
 # students -----------------------------------------------------------------------------
-
-
-def write_student_rows(path, policy=(90.0, 110.0)):
-    """Two seeds of a default student, one of the paper's, and a budget chosen by flags."""
-    def rows(first, second, samples=32, iterations=3):
-        return [{"step": 9, "return_mean": np.mean(returns), "returns": returns,
-                 "expert_returns": [200.0, 50.0], "policy_returns": policy, "minutes": 6.0,
-                 "evaluation_seed": evaluation_seed, "ranks": {
-                     "rank_correlation_returns": [0.9, 0.5], "plan_ms_expert": 9.0,
-                     "plan_ms_student_in_process": 2.0, "plan_ms_policy": 1.0, "samples": samples,
-                     "iterations": iterations, **({
-                         "plan_ms_same_search": 5.0, "same_search_returns": [210.0, 20.0]}
-                         if samples == 32 else {})}}
-                for evaluation_seed, returns in ((1, second), (0, first))]
-
-    own = {"steps": 9, "num_agents": 6}
-    full = {**own, "samples": 512, "iterations": 6}
-    write_rows(path, [("walker-run", 0, "default", own, rows([180.0, 20.0], [250.0, 0.0])),
-                      ("walker-run", 1, "default", own, rows([140.0, 10.0], [200.0, 0.0])),
-                      ("walker-run", 0, "paper", own, rows([90.0, 10.0], [80.0, 0.0], 512, 6)),
-                      ("walker-run", 0, "default", full, rows([100.0], [100.0], 512, 6)),
-                      ("walker-run", 1, "default", full, rows([100.0], [100.0], 512, 6))])
-
-
-def test_the_table_of_students_has_a_line_for_each_preset_and_each_chosen_budget(tmp_path):
-    write_student_rows(tmp_path / "students.csv")
-    result, text = experiments.report_students("students", tmp_path / "students.csv", tmp_path)
-    tables = []
-    for table in text.split("\n\n"):
-        heads, _, *lines = ([part.strip() for part in line.split("|")[1:-1]]
-                            for line in table.splitlines())
-        tables.append([dict(zip(heads, line)) for line in lines])
-    (own, paper, chosen), (search,) = tables
-    # over both evaluation seeds: 100, 75, 125, 100; students of each episode less 210 and 20: of
-    # both students -50, -5, 15, -20, a standard error of 13.7; of each -2.5, -27.5, one of 12.5
-    assert [*search.values()] == ["walker-run", "125", "100", "115", "100", "-15 ± 19", "9.0",
-                                  "1.0", "5.0", "2.0"]
-    assert (own["task"], own["N"], own["MPPI"]) == ("walker-run", "6", "32 x 3")
-    assert own["expert"] == "125 ± 75" and own["its policy alone"] == "100 ± 10"  # over episodes
-    assert own["student"] == "88 ± 18"  # 100 and 75: over seeds, n - 1
-    assert own[students.FASTER] == "4.5 / 2.5"
-    assert own["the same search with the expert: kept"] == "0.92"  # 115 of 125
-    assert (own["seeds"], own["minutes"]) == ("2", "6")
-    assert own[students.KEPT] == "0.70 / 0.90"
-    assert own["least kept"] == "0.60"  # of each seed's two: 0.80, 0.60; 1.00, 0.80
-    # 110, -60 twice; each episode's mean over the two seeds: 70, -95, 135, -110, an error of 60.7;
-    # each seed's over the episodes: 12.5, -12.5, one of 12.5
-    assert own["planning wins, expert / student"] == "25 ± 49 / 0 ± 62"
-    assert own["rank correlation of G, H = 0 / last"] == "0.90 / 0.50"
-    assert own["authors' logs: 100% TD-MPC / Fac-TDMPC"] == "836 / 809"
-    assert (paper["task"], paper["seeds"], paper["MPPI"]) == ("walker-run, paper", "1", "512 x 6")
-    assert paper[students.KEPT] == "0.40 / 0.32"
-    assert paper[students.FASTER] == "4.5"
-    assert paper["the same search with the expert: kept"] == "-"
-    assert chosen["task"] == "walker-run, samples 512, iterations 6"
-    assert list(result) == [own["task"], paper["task"], chosen["task"]]
-    assert result["walker-run"]["MPPI"] == "32 x 3"
-    write_student_rows(tmp_path / "none.csv", policy=())  # an expert without a policy
-    _, text = experiments.report_students("students", tmp_path / "none.csv", tmp_path)
-    assert "| 125 ± 75 | - | 2 | 32 x 3 | 88 ± 18 |" in text
-
-
-def test_another_budget_of_one_seed_leaves_the_default_s_line_whole(tmp_path):
-    write_student_rows(path := tmp_path / "students.csv")
-    head, *lines = path.read_text().splitlines()
-    path.write_text("\n".join([head, *(line for line in lines if not (
-        line.startswith("walker-run,1") and "samples\"\": 512" in line.split("}")[0]))]))
-    result, _ = experiments.report_students("students", path, tmp_path)
-    assert result["walker-run"]["seeds"] == 2
-
-
-def test_the_report_holds_the_tables_that_the_rows_give():
-    results = ROOT / "data" / "results"
-    _, text = experiments.report_students("students", results / "students.csv", None)
-    report = (results / "report.md").read_text(encoding="utf-8")
-    assert [table in report for table in text.split("\n\n")] == [True, True]
 
 
 def test_what_each_joint_wins_alone_is_told_in_two_tables(tmp_path):
@@ -1144,23 +1076,25 @@ def test_what_each_joint_wins_alone_is_told_in_two_tables(tmp_path):
                  "expert_returns": [200.0, 120.0], "policy_returns": [90.0, 110.0],
                  "evaluation_seed": seed, "ranks": {
                      "max_std": 0.15, "samples": 32, "iterations": iterations, **more,
-                     "plan_ms_expert": 9.0, "plan_ms_student_in_process": 2.0}}
+                     "rank_correlation_returns": [0.9, 0.7, 0.5], "plan_ms_expert": 9.0,
+                     "plan_ms_student_in_process": 2.0}}
                 for seed in (101, 102)]
 
+    own = {"num_agents": 6}
     write_rows(tmp_path / "alone.csv", [
-        ("walker-run", 0, "default", {"num_agents": 6}, rows(0)),
-        ("cheetah-run", 0, "default", {"num_agents": 6}, rows(
+        ("walker-run", 0, "default", own, rows(0)),
+        ("walker-stand", 0, "paper", own, rows(
             3, reflex_returns=[80.0, 60.0], same_search_returns=[210.0, 20.0]))])
     _, text = experiments.report_alone("alone", tmp_path / "alone.csv", None)
     short, whole = ([[cell.strip() for cell in line.split("|")[1:-1]] for line in
                      table.splitlines()[2:]] for table in text.split("\n\n"))
     # less the expert's: -40, 20, twice, a standard error of 17.3
     assert short == [["walker-run, 6", "160", "100", "150 ± 17", "4"],
-                     ["cheetah-run, 6", "160", "100", "150 ± 17", "4"]]
+                     ["walker-stand, paper, 6", "160", "100", "150 ± 17", "4"]]
     assert whole == [["walker-run", "6", "2", "160", "100", "150", "150", "100", "0.94 ± 0.11",
-                      "none", "9.0", "2.0"],
-                     ["cheetah-run", "6", "2", "160", "100", "70", "150", "115", "0.94 ± 0.11",
-                      "32 x 3, 0.15", "9.0", "2.0"]]
+                      "none", "9.0", "2.0", "0.90 / 0.50", "836 / 809"],
+                     ["walker-stand, paper", "6", "2", "160", "100", "70", "150", "115",
+                      "0.94 ± 0.11", "32 x 3, 0.15", "9.0", "2.0", "0.90 / 0.50", "-"]]
 
 
 def test_one_model_for_all_joints_has_as_many_weights_as_a_model_for_each():
@@ -1351,7 +1285,25 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
         assert f"numpy {np.__version__}" in row["versions"] and "mujoco 3" in row["versions"]
     result = json.loads((tmp_path / "reacher-easy-3" / "result.json").read_text())
     assert (result["eval_seed"], result["samples"]) == (101, 32)
-    experiments.report_students("students", path, tmp_path)
+    _, text = experiments.report_alone("alone", path, tmp_path)
+    lines = [line.split("|")[1].strip() for line in text.split("\n\n")[1].splitlines()[2:]]
+    assert lines == ["reacher-easy", "reacher-easy, samples 4, iterations 1"]
+
+
+def write_student_rows(path):
+    """Two seeds of a default student, one of the paper's, and a budget chosen by flags."""
+    def rows(samples=32, iterations=3):
+        return [{"step": 9, "return_mean": 7.0, "minutes": 6.0, "evaluation_seed": seed, "ranks": {
+            "plan_ms_expert": 9.0, "plan_ms_student_in_process": 2.0, "samples": samples,
+            "iterations": iterations}} for seed in (102, 101)]
+
+    own = {"steps": 9, "num_agents": 6}
+    full = {**own, "samples": 512, "iterations": 6}
+    write_rows(path, [("walker-run", 0, "default", own, rows()),
+                      ("walker-run", 1, "default", own, rows()),
+                      ("walker-run", 0, "paper", own, rows(512, 6)),
+                      ("walker-run", 0, "default", full, rows(512, 6)),
+                      ("walker-run", 1, "default", full, rows(512, 6))])
 
 
 def test_milliseconds_of_students_are_measured_anew_for_each_preset_and_budget(tmp_path,
