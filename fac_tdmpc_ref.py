@@ -8,8 +8,8 @@ action dimension. Each joint then acts and plans alone: cheaper, and in parallel
 
 Part I is the method, to be read from top to bottom: 1 settings, 2 layers, 3 world model, 4
 distillation (Equation 4, Algorithm 1), 5 planning (Equations 2 and 3). It runs (`distill --plain`).
-Part II adds [D8], credit and what teaches priors [D9], `reuse` [D1], speed and the engineering.
-Experts learn, by Equation 1, in data/ [D6]. The README lists the departures, [D1] to [D9].
+Part II adds [D8], credit and what teaches priors [D9], pools of reused copies [D1], speed, and the
+engineering. Experts learn, by Equation 1, in data/. The README lists departures, [D1] to [D9].
 
 The one idea that keeps it small: every model carries an agent axis N, and a centralized model is
 the case N = 1. There is one world model, one planner, one loss. The axes, everywhere:
@@ -19,7 +19,7 @@ the case N = 1. There is one world model, one planner, one loss. The axes, every
     d   action dimensions of an agent: dim(A) / N
     O   observation features;   A = N * d   action dimensions
     B   batch;   S   action sequences (the last axis);   M   rows of a replay
-    K   noise samples of the distillation loss; its actions are (L, A, B, K), a plan's (N, L, d, S)
+    K   noisy copies in the loss, whose actions are (L, A, B, K); a plan's: (N, L, d, S), S for B
     H   horizon: a return G is H discounted rewards, then Q;   L   actions: H + 1 (Eq. 2 and 4)
     F   features an encoder reads;   P   proposals;   E   elites, or episodes;   T   decisions
 
@@ -76,7 +76,7 @@ class ModelConfig(Settings):
     mlp_dim: int = field(512, "hidden width of an agent's other networks (Table 2)", least=1)
     expert_latent_dim: int = field(0, "features of an expert's latent to encode; 0: none", least=0)
     expert_enc_dim: int = field(256, "hidden width of the expert's encoder", least=1)
-    prior_steps: int = field(0, "actions that an agent's own prior names [D9]; 0: none", least=0)
+    prior_steps: int = field(0, "actions that an agent's own prior gives [D9]; 0: none", least=0)
     groups: str = field("", "robot's action dimensions of each agent, 0,2/1,3; '': in order")
 
     @property
@@ -90,7 +90,7 @@ class PlannerConfig(Settings):
     """MPPI. A model's file may name others. Raises UserError for values that can't plan."""
     samples: int = field(128, "S: sequences drawn at once [D5]", paper=512, least=1, most=10 ** 6)
     iterations: int = field(4, "of MPPI [D5]; 0: the priors act", paper=6, least=0)
-    prior: str = field("last", "first mean: the last plan's, moved on, or by the agents' own "
+    prior: str = field("last", "first mean: the last plan's, shifted, or by the agents' own "
                        "priors (an expert: policy) [D9]", repr=False, choices=("last", "own"))
     elites: int = field(0, "best, which make the next mean; 0: samples / 8 (Table 2: 64)", least=0)
     pi_trajs: int = field(24, "P: policy proposals (Table 2)", least=0, most=10 ** 6)
@@ -98,11 +98,11 @@ class PlannerConfig(Settings):
     discount: float = field(0.99, "gamma (Table 2)", least=0, most=1)
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)", above=0)
     max_std: float = field(2.0, "largest and first one (Table 2) [D9]", above=0)
-    inverse_temperature: float = field(0.5, "elites score exp(this * G) (TD-MPC's code)", above=0)
+    inverse_temperature: float = field(0.5, "elites score exp(this * G) (Table 2)", above=0)
     momentum: float = field(0.1, "part of the old mean in the new (TD-MPC's code)", least=0, most=1)
     speed: str = field("fast", "Equation 2 by Part II or, plain, as Part I reads", repr=False,
                        choices=("fast", "plain"))
-    output: str = field("sampled", "an elite drawn by score (TD-MPC's code), or the mean [D5]",
+    output: str = field("sampled", "an elite drawn by score (TD-MPC's code), or 3.2's mean [D5]",
                         paper="mean", choices=("sampled", "mean"))
     action_repeat: int = field(ACTION_REPEAT, "control steps a decision", repr=False)
 
@@ -139,7 +139,7 @@ class Algorithm1Config(Settings):
 
 
 def student_config(theirs, num_agents, encoder_input, prior_steps=0):
-    """A student's sizes; hidden layers are max(its expert's // N, 50) wide."""
+    """A student's sizes: as by default, but MLPs are max(its expert's // N, 50) wide."""
     num_agents = theirs.dim_action if num_agents is None else num_agents
     latent = theirs.num_agents * theirs.latent_dim * (encoder_input == "latent")
     return ModelConfig(theirs.dim_obs, theirs.dim_action, num_agents, prior_steps=prior_steps,
@@ -174,7 +174,7 @@ def linear(x, W, b):
 
 
 def linear_dx(dy, W):
-    """dx = W^T dy of y = W x + b; BLAS is slow at the outer product that it is of a single row."""
+    """dx = W^T dy of y = W x + b; an outer product, at which BLAS is slow, for a single output."""
     return W.swapaxes(1, 2) @ dy if W.shape[1] > 1 else W.swapaxes(1, 2) * dy
 
 
@@ -371,8 +371,8 @@ class WorldModel:
         return "_pi.0.weight" in self.params
 
     def latents(self, obs, search=True):
-        """What agents plan from, obs (O, B) -> s^i (N, m, B); with priors [D9] s^i and what these
-        read, (N, 2m, B), without a search what these read alone."""
+        """What agents plan from, obs (O, B) -> s^i (N, m, B); with priors [D9] s^i and below it the
+        latents that the priors read, (N, 2m, B); without a search only these, (N, m, B)."""
         x = self.read(obs)
         if not self.config.prior_steps:
             return self.encode_features(x)
@@ -427,7 +427,7 @@ def unroll(model, z, actions, tapes=None):
     L, _, B, K = actions.shape
     n, m, d = model.config.num_agents, model.config.latent_dim, model.config.agent_actions
     x = np.empty((n, m + d, L * B * K), z.dtype)
-    # A is cut into N x d: of N = 3, d = 2 agent 0 has actions 0 and 1, agent 1 has 2 and 3, ...
+    # A, already in the order of `groups`, is cut into N x d: with d = 2 agent 0 has the first two
     x[:, m:] = actions.reshape(L, n, d, B * K).transpose(1, 2, 0, 3).reshape(n, d, -1)
     x[:, :m, :B * K] = np.repeat(z, K, axis=2)
     for h in range(L - 1):
@@ -452,7 +452,7 @@ def predict(model, z, actions, tapes=None):
 
 def heads_backward(model, tapes, d_shares, grads):
     """Walk `run_heads` back: adds to `grads`, returns dx (N, m + d, L * B * K). d_shares: gradients
-    by each share (N, L, B, K), or by sums of shares (fewer rows), the same for each summand."""
+    by each share (N, L, B, K), or by their sum (1, L, B, K), the same for each summand."""
     n, dx = model.config.num_agents, 0
     for name, dy in zip(HEADS, d_shares):
         dy = np.repeat(dy, n // len(dy), 0).reshape(n, 1, -1)  # of a sum: the same N times
@@ -461,7 +461,7 @@ def heads_backward(model, tapes, d_shares, grads):
 
 
 def unroll_backward(model, tapes, actions, dx, grads):
-    """Walk `unroll` back from dx, by its x: adds to dx and to `grads`, returns dz (N, m, B)."""
+    """Walk `unroll` back from dx, by its x (overwritten): adds to `grads`, returns dz (N, m, B)."""
     (L, _, B, K), n, m = actions.shape, model.config.num_agents, model.config.latent_dim
     for h in reversed(range(L - 1)):
         now, after = (slice(i * B * K, (i + 1) * B * K) for i in (h, h + 1))
@@ -481,7 +481,7 @@ def log_softmax(x):
 def soft_kl(student, expert, temperature_student, temperature_expert, kind="forward"):
     """D(p_e || p_s) of p_e = softmax(expert / T_e) and p_s = softmax(student / T_s), Equation 4.
 
-    student, expert (..., K): predictions at h for K copies, each in its own s_h. "reverse"
+    student, expert (..., K): predictions for K copies, whose s_h differ from h = 1 on. "reverse"
     is D(p_s || p_e) [D2]. Returns the divergence (...) and its gradient by `student` (..., K)."""
     log_s = log_softmax(student / temperature_student)
     log_e = log_softmax(expert / temperature_expert)
@@ -518,7 +518,7 @@ def divergences(heads, targets, config, divergence=soft_kl):
     """`distill_loss`'s result from the shares of `run_heads`; and the loss's gradients by these:
     three (N, L, B, K), or, for targets of the sum, (1, L, B, K), the same for all agents."""
     _, L, B, K = heads[0].shape
-    lam = (config.lam ** np.arange(L) / B).astype(heads[0].dtype)[:, None]
+    weight = (config.lam ** np.arange(L) / B).astype(heads[0].dtype)[:, None]  # a mean over B
     loss, means, d_shares = 0.0, [], []
     coefs = (config.reward_coef, config.value_coef, config.value_coef)
     for coef, shares, target in zip(coefs, heads, targets):
@@ -526,9 +526,9 @@ def divergences(heads, targets, config, divergence=soft_kl):
         output = shares.reshape(len(target), -1, L, B, K).sum(1)  # so sum N shares, or keep each
         kl, d_output = divergence(output, target, config.temperature_student,
                                   config.temperature_expert, config.kl)
-        loss += coef * float((lam * kl).sum())
+        loss += coef * float((weight * kl).sum())
         means.append(float(kl.sum(0).mean()))
-        d_shares.append(coef * lam[..., None] * d_output)
+        d_shares.append(coef * weight[..., None] * d_output)
     return (loss, means[0], (means[1] + means[2]) / 2), d_shares
 
 
@@ -568,8 +568,8 @@ def perturbed_batch(expert, student, obs, actions, config, rng):
 def distill(expert, replay, config, num_agents=None, seed=0, made=None):
     """Algorithm 1 by its lines: a factored student of an expert; yields it with each step's losses.
 
-    replay: the dataset, a `Replay`. `starts`: rows that H + 1 actions follow, to learn from and
-    held out; `sequences`: rows' g_0 (O, B), these actions (L, A, B). made: Adam, student so far."""
+    replay: the dataset, Part II's `Replay`: `starts(...)` gives rows to learn from, and held out;
+    `sequences(rows, L)` their g_0 (O, B), next actions (L, A, B). made: (Adam, student) so far."""
     sizes = student_config(expert.config, num_agents, config.encoder_input)
     optimizer, student = made or new_student(expert, sizes, seed)
     starts, _ = replay.starts(config.horizon + 1, config.held_out, seed)
@@ -604,8 +604,8 @@ def h_step_return(model, z, actions, config):
 def mppi(returns, mean, config, rngs, proposals=None):
     """MPPI: refine a Gaussian over action sequences by its elites, in every iteration anew.
 
-    returns: actions (N, L, d, S) -> every G_i (N, S); mean (N, L, d): the first Gaussian's; rngs:
-    one Generator for each agent; proposals (N, L, d, P): sequences that compete in every iteration.
+    returns, a function: actions (N, L, d, S) -> G_i (N, S); mean (N, L, d): the first Gaussian's;
+    rngs: a Generator an agent; proposals (N, L, d, P): sequences that compete in every iteration.
     Elites are chosen agent by agent: G is sum_i G_i(a_i), so the best of each is the best of all
     (Equation 3, Proposition 1). N = 1 is centralized MPPI. Returns the new mean (N, L, d), the last
     elites (N, L, d, E) and their scores (N, E), of sum 1, NaN without a finite G."""
@@ -664,7 +664,7 @@ class AgentPlanner:
         self.reset()
 
     def reset(self, seeds=()):
-        """Start an episode: mean zero. seeds: a SeedSequence an agent, before the first plan."""
+        """Start an episode, mean zero. seeds: a SeedSequence an agent; a first plan needs them."""
         sizes, L = self.model.config, self.config.horizon + 1 if self.config.iterations else 1
         self.mean = np.zeros((sizes.num_agents, L, sizes.agent_actions), F32)
         if seeds:
@@ -672,8 +672,8 @@ class AgentPlanner:
 
     def plan(self, latents):
         """`WorldModel.latents` (N, ., 1) -> actions (N, L, d), the first of which acts. A search
-        begins from the agents' own priors [D9] or from the last mean, moved on; without a search
-        the priors act (L = 1)."""
+        begins from the agents' own priors [D9] or from the last mean, shifted. Without a search
+        the priors act (L = 1; `check_settings` lets nothing else be planned so)."""
         own = self.config.prior == "own"
         first = self.model.prior(latents, self.mean.shape[1])[..., 0] if own else self.mean
         if not self.config.iterations:
@@ -685,7 +685,7 @@ class AgentPlanner:
         return mean if self.config.output == "mean" else draw_elite(elites, scores, self.rngs)
 
     def returns_from(self, z):
-        """What `mppi` asks: actions (N, L, d, S) -> G (N, S)."""
+        """`mppi`'s `returns`."""
         return functools.partial(h_step_return, self.model, z, config=self.config)
 
     def proposals(self, z):
