@@ -219,7 +219,8 @@ def alone_tables(lines, authors):
         ms = [np.mean([of[f"plan_ms_{who}"] for of in about])
               for who in ("expert", "student_in_process")]
         agents = json.loads(own[0]["settings"])["num_agents"]
-        short.append([f"{line}, {agents}", expert, policy, f"{student} ± {error:.0f}",
+        star = "\\*" * any(of["iterations"] for of in about)  # some search
+        short.append([f"{line}, {agents}", expert, policy, f"{student} ± {error:.0f}{star}",
                       f"{ms[0] / ms[1]:.0f}"])
         whole.append([line, agents, len(about), expert, policy, reflex, student, same,
                       f"{kept(own):.2f} ± {error / overall(own, 'expert_returns'):.2f}", search,
