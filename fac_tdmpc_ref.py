@@ -19,7 +19,7 @@ the case N = 1. There is one world model, one planner, one loss. The axes, every
     d   action dimensions of an agent: dim(A) / N
     O   observation features;   A = N * d   action dimensions
     B   batch;   S   action sequences (the last axis);   M   rows of a replay
-    K   noisy copies in the loss, whose actions are (L, A, B, K); a plan's: (N, L, d, S), S for B
+    K   noisy copies in the loss, whose actions are (L, A, B, K); in a plan they are (N, L, d, S)
     H   horizon: a return G is H discounted rewards, then Q;   L   actions: H + 1 (Eq. 2 and 4)
     F   features an encoder reads;   P   proposals;   E   elites, or episodes;   T   decisions
 
@@ -33,7 +33,7 @@ action sequence that the expert's policy suggests to a plan. What a student comp
     sum over i (not for credit [D9]) -> R_h, Q_h (L, B, K) -> softmax over K -> divergence (Eq. 4)
 
 A layer is W (N, out, in), b (N, out, 1) and computes W @ x + b on x (N, in, B): samples last, so
-that activations run over long rows. A torch Linear.weight is weight[None] here, itself in files.
+that activations run over long rows. A torch Linear.weight is itself in files, weight[None] here.
 """
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def linear(x, W, b):
 
 
 def linear_dx(dy, W):
-    """dx = W^T dy of y = W x + b; an outer product, at which BLAS is slow, for a single output."""
+    """dx = W^T dy; of one output an outer product, which is slow in BLAS: broadcast."""
     return W.swapaxes(1, 2) @ dy if W.shape[1] > 1 else W.swapaxes(1, 2) * dy
 
 
@@ -285,8 +285,8 @@ class Adam:
                        for i in range(0, len(self.vector), 16384)]  # what fits a core's cache
 
     def step(self, lr, clip=np.inf):
-        """params -= lr m_hat / (sqrt(v_hat) + eps), of the gradient clipped to norm `clip`, which
-        is then set to zero; returns its norm before."""
+        """params -= lr m_hat / (sqrt(v_hat) + eps), of the gradient clipped to norm `clip`. Sets
+        the gradient to zero; returns its norm before."""
         length, beta1, beta2, eps = float(np.linalg.norm(self.gradient)), 0.9, 0.999, 1e-8
         if length > clip:
             self.gradient *= self.gradient.dtype.type(clip / (length + 1e-6))  # PyTorch's 1e-6
@@ -371,8 +371,8 @@ class WorldModel:
         return "_pi.0.weight" in self.params
 
     def latents(self, obs, search=True):
-        """What agents plan from, obs (O, B) -> s^i (N, m, B); with priors [D9] s^i and below it the
-        latents that the priors read, (N, 2m, B); without a search only these, (N, m, B)."""
+        """What agents plan from, obs (O, B) -> s^i (N, m, B); with priors [D9] s^i stacked on
+        what the priors read, (N, 2m, B); without a search the latter alone, (N, m, B)."""
         x = self.read(obs)
         if not self.config.prior_steps:
             return self.encode_features(x)
@@ -461,7 +461,7 @@ def heads_backward(model, tapes, d_shares, grads):
 
 
 def unroll_backward(model, tapes, actions, dx, grads):
-    """Walk `unroll` back from dx, by its x (overwritten): adds to `grads`, returns dz (N, m, B)."""
+    """From the last h down f_T carries dx of h + 1 into dx of h; adds to `grads`; dz (N, m, B)."""
     (L, _, B, K), n, m = actions.shape, model.config.num_agents, model.config.latent_dim
     for h in reversed(range(L - 1)):
         now, after = (slice(i * B * K, (i + 1) * B * K) for i in (h, h + 1))
@@ -481,15 +481,15 @@ def log_softmax(x):
 def soft_kl(student, expert, temperature_student, temperature_expert, kind="forward"):
     """D(p_e || p_s) of p_e = softmax(expert / T_e) and p_s = softmax(student / T_s), Equation 4.
 
-    student, expert (..., K): predictions for K copies, whose s_h differ from h = 1 on. "reverse"
+    student, expert (..., K): predictions for K copies, each rolled out by itself. "reverse"
     is D(p_s || p_e) [D2]. Returns the divergence (...) and its gradient by `student` (..., K)."""
     log_s = log_softmax(student / temperature_student)
     log_e = log_softmax(expert / temperature_expert)
     p_s, p_e = np.exp(log_s), np.exp(log_e)
-    if kind == "forward":   # with x = student / T_s: d log p_s,j / d x_k = [j=k] - p_s,k
+    if kind == "forward":   # by x = student / T_s: -sum_j p_e,j ([j=k] - p_s,k)
         kl = (p_e * (log_e - log_s)).sum(-1)
         return kl, (p_s - p_e) / temperature_student
-    gap = log_s - log_e     # sum p_s (log p_s - log p_e)
+    gap = log_s - log_e     # dp_s,j / dx_k = p_s,j ([j=k] - p_s,k), and sum_j of them is 0
     kl = (p_s * gap).sum(-1)
     return kl, p_s * (gap - kl[..., None]) / temperature_student
 
@@ -515,15 +515,15 @@ def distill_loss(student, features, actions, targets, config, grads=None, diverg
 
 
 def divergences(heads, targets, config, divergence=soft_kl):
-    """`distill_loss`'s result from the shares of `run_heads`; and the loss's gradients by these:
-    three (N, L, B, K), or, for targets of the sum, (1, L, B, K), the same for all agents."""
+    """What `distill_loss` returns, and the loss's gradients by each head's shares: three
+    (N, L, B, K) or, where targets are sums, (1, L, B, K), the same for all agents."""
     _, L, B, K = heads[0].shape
     weight = (config.lam ** np.arange(L) / B).astype(heads[0].dtype)[:, None]  # a mean over B
     loss, means, d_shares = 0.0, [], []
     coefs = (config.reward_coef, config.value_coef, config.value_coef)
     for coef, shares, target in zip(coefs, heads, targets):
         target = target.reshape(-1, L, B, K)  # one row: of the sum; N rows: of each share
-        output = shares.reshape(len(target), -1, L, B, K).sum(1)  # so sum N shares, or keep each
+        output = shares.reshape(len(target), -1, L, B, K).sum(1)  # 1 x N: their sum; N x 1: each
         kl, d_output = divergence(output, target, config.temperature_student,
                                   config.temperature_expert, config.kl)
         loss += coef * float((weight * kl).sum())
@@ -568,13 +568,13 @@ def perturbed_batch(expert, student, obs, actions, config, rng):
 def distill(expert, replay, config, num_agents=None, seed=0, made=None):
     """Algorithm 1 by its lines: a factored student of an expert; yields it with each step's losses.
 
-    replay: the dataset, Part II's `Replay`: `starts(...)` gives rows to learn from, and held out;
+    replay: the dataset, Part II's `Replay`: `starts(...)` gives (rows to learn from, held out);
     `sequences(rows, L)` their g_0 (O, B), next actions (L, A, B). made: (Adam, student) so far."""
     sizes = student_config(expert.config, num_agents, config.encoder_input)
     optimizer, student = made or new_student(expert, sizes, seed)
     starts, _ = replay.starts(config.horizon + 1, config.held_out, seed)
     for t in range(optimizer.t, config.steps):                                          # line 3
-        rng = stream(seed, f"pool {t}")
+        rng = stream(seed, f"pool {t}")  # Part II draws states for several steps, a pool
         rows = rng.choice(starts, config.batch_size)
         obs, actions = replay.sequences(rows, config.horizon + 1)                       # line 4
         batch = perturbed_batch(expert, student, obs, actions[..., None], config, rng)
@@ -657,7 +657,7 @@ def policy_rollout(model, z, noise):
 
 class AgentPlanner:
     """Plans for each of a model's agents from its own latent, networks, random stream and prior
-    alone. Part II has it faster, and gives processes models of some of the agents."""
+    alone: so processes that share the agents plan the same (Part II, which also has it faster)."""
 
     def __init__(self, model, config):
         self.model, self.config = model, config
@@ -665,7 +665,7 @@ class AgentPlanner:
 
     def reset(self, seeds=()):
         """Start an episode, mean zero. seeds: a SeedSequence an agent; a first plan needs them."""
-        sizes, L = self.model.config, self.config.horizon + 1 if self.config.iterations else 1
+        sizes, L = self.model.config, 1 + self.config.horizon * (self.config.iterations > 0)
         self.mean = np.zeros((sizes.num_agents, L, sizes.agent_actions), F32)
         if seeds:
             self.rngs = [np.random.Generator(np.random.SFC64(seed)) for seed in seeds]
