@@ -103,23 +103,21 @@ def distil(task, seed, case, settings):
             row.update(rank_q=float(q[0]), rank_return=float(g[-1]))
     reflex, policy = (dataclasses.replace(of, prior="own", iterations=0)
                       for of in (planning, planning_for(header, {})))
-    for evaluation_seed in students.EVALUATION_SEEDS:
-        def returns(model, planning, environment=None):
-            return returns_of(model, task, planning, count, evaluation_seed, environment)
-        alone = planning.prior == "own" and returns(student, reflex).tolist()
-        yield {**row, **of_returns(returns(student, planning, environment), evaluation_seed),
-               "policy_returns": np.round(returns(expert, policy), 3).tolist(),
-               "ranks": {"reflex_returns": alone} if alone else {}}
+    for of in students.EVALUATION_SEEDS:
+        row.update(of_returns(returns_of(student, task, planning, count, of, environment), of))
+        if expert.has_policy:
+            found = returns_of(expert, task, policy, count, of)
+            row["policy_returns"] = np.round(found, 3).tolist()
+        if planning.prior == "own":
+            row["ranks"] = {"reflex_returns": returns_of(student, task, reflex, count, of).tolist()}
+        yield {**row}
 
 
 FIGURE4 = {"default": {}, "N = 1": {"num_agents": 1}, "10% TD-MPC": {}, "TAP": {}}
-FIGURE5 = {  # panel: {case: settings}; every panel holds the default
-    "loss": {"default": {}, "joint targets": {"targets": "joint"}, "MSE": {"targets": "joint"}},
-    "noise deviation": {"default": {}, **{f"noise {x}": {"noise_std": x} for x in (0.1, 1.0, 2.0)}},
-    "student temperature": {"default": {}, **{f"T_s {x}": {"temperature_student": x}
-                                              for x in (0.1, 2.0)}},
-    "consistency": {"default": {}, "consistency": {}, "consistency 0.03": {}}}
-FIGURE5_CASES = {case: settings for panel in FIGURE5.values() for case, settings in panel.items()}
+FIGURE5 = {"default": {}, "joint targets": {"targets": "joint"}, "MSE": {"targets": "joint"},
+           **{f"noise {x}": {"noise_std": x} for x in (0.1, 1.0, 2.0)},
+           **{f"T_s {x}": {"temperature_student": x} for x in (0.1, 2.0)},
+           "consistency": {}, "consistency 0.03": {}}
 
 
 def distil_all(args, cases):
@@ -718,7 +716,7 @@ def report_figure8(_, path, figures):
                    *(f"{x:.2f}" for x in own.values())) for case, own in result[task].items()]
         table += [(task, f"student - {case}", "", *(
             difference_cell(kept["student"][kind], kept[case][kind]) for kind in KINDS))
-            for case in kept if case != "student"]
+            for case in kept if case != "student" and "student" in kept]
     return result, markdown(("", "", "undisturbed", *KINDS), table)
 
 
@@ -836,7 +834,7 @@ def make_parser():
     add_cases("figure4", distil_and_time, FIGURE4, "Section 5.2: Fac-TDMPC, TD-MPC in Table 2's "
               "size and the small one of B.2, and TAP, by Algorithm 1; return against steps, then "
               "milliseconds (keep the machine quiet for these).", shipped)
-    add_cases("figure5", distil_all, FIGURE5_CASES, "Section 5.3: KL against MSE (and without "
+    add_cases("figure5", distil_all, FIGURE5, "Section 5.3: KL against MSE (and without "
               "credit), the perturbations' deviation (clipped), the student's temperature, a "
               "consistency loss.", walkers)
     add_runs("departures", command_departures, "The differences in distillation one at a time, "
