@@ -90,15 +90,15 @@ class PlannerConfig(Settings):
     """MPPI. A model's file may name others. Raises UserError for values that can't plan."""
     samples: int = field(128, "S: sequences drawn at once [D5]", paper=512, least=1, most=10 ** 6)
     iterations: int = field(4, "of MPPI [D5]; 0: the priors act", paper=6, least=0)
-    prior: str = field("last", "first mean: the last plan's, shifted, or by the agents' own "
-                       "priors (an expert: policy) [D9]", repr=False, choices=("last", "own"))
+    prior: str = field("last", "first mean: the last plan's, shifted; own: the agents' own "
+                       "priors' (an expert's: policy's) [D9]", repr=False, choices=("last", "own"))
     elites: int = field(0, "best, which make the next mean; 0: samples / 8 (Table 2: 64)", least=0)
     pi_trajs: int = field(24, "P: policy proposals (Table 2)", least=0, most=10 ** 6)
     horizon: int = field(3, "H of Equation 2", least=0, most=EPISODE_STEPS - 1)
     discount: float = field(0.99, "gamma (Table 2)", least=0, most=1)
     min_std: float = field(0.05, "smallest sampling deviation (Table 2)", above=0)
     max_std: float = field(2.0, "largest and first one (Table 2) [D9]", above=0)
-    inverse_temperature: float = field(0.5, "elites score exp(this * G) (Table 2)", above=0)
+    inverse_temperature: float = field(0.5, "scores: exp(this * G). Table 2: temperature", above=0)
     momentum: float = field(0.1, "part of the old mean in the new (TD-MPC's code)", least=0, most=1)
     speed: str = field("fast", "Equation 2 by Part II or, plain, as Part I reads", repr=False,
                        choices=("fast", "plain"))
@@ -306,8 +306,8 @@ class WorldModel:
     """f_E, f_T, f_R, f_Q with an agent axis: TD-MPC for N = 1, Fac-TDMPC for N = A.
 
     `params` maps TD-MPC's state-dict names to arrays with a leading agent axis. The encoder is
-    centralized; only experts have TD-MPC's policy, `_pi`, only students a prior for each agent,
-    `_prior` [D9], and their expert's frozen encoder, whose latent their own encoders read [D3]."""
+    centralized. Experts also have TD-MPC's policy, `_pi`; students a prior for each agent, `_prior`
+    [D9], and their expert's frozen encoder, whose latent their own encoders read [D3]."""
 
     def __init__(self, config, params):
         self.config, self.params = config, params
@@ -461,7 +461,7 @@ def heads_backward(model, tapes, d_shares, grads):
 
 
 def unroll_backward(model, tapes, actions, dx, grads):
-    """From the last h down f_T carries dx of h + 1 into dx of h; adds to `grads`; dz (N, m, B)."""
+    """From the last h down add f_T's part to dx, and to `grads`; returns dz, summed over K."""
     (L, _, B, K), n, m = actions.shape, model.config.num_agents, model.config.latent_dim
     for h in reversed(range(L - 1)):
         now, after = (slice(i * B * K, (i + 1) * B * K) for i in (h, h + 1))
@@ -486,7 +486,7 @@ def soft_kl(student, expert, temperature_student, temperature_expert, kind="forw
     log_s = log_softmax(student / temperature_student)
     log_e = log_softmax(expert / temperature_expert)
     p_s, p_e = np.exp(log_s), np.exp(log_e)
-    if kind == "forward":   # by x = student / T_s: -sum_j p_e,j ([j=k] - p_s,k)
+    if kind == "forward":   # by x_k = student_k / T_s: p_s,k sum_j p_e,j - p_e,k
         kl = (p_e * (log_e - log_s)).sum(-1)
         return kl, (p_s - p_e) / temperature_student
     gap = log_s - log_e     # dp_s,j / dx_k = p_s,j ([j=k] - p_s,k), and sum_j of them is 0
@@ -574,7 +574,7 @@ def distill(expert, replay, config, num_agents=None, seed=0, made=None):
     optimizer, student = made or new_student(expert, sizes, seed)
     starts, _ = replay.starts(config.horizon + 1, config.held_out, seed)
     for t in range(optimizer.t, config.steps):                                          # line 3
-        rng = stream(seed, f"pool {t}")  # Part II draws states for several steps, a pool
+        rng = stream(seed, f"pool {t}")  # Part II: one pool of states for several steps
         rows = rng.choice(starts, config.batch_size)
         obs, actions = replay.sequences(rows, config.horizon + 1)                       # line 4
         batch = perturbed_batch(expert, student, obs, actions[..., None], config, rng)
@@ -673,7 +673,7 @@ class AgentPlanner:
     def plan(self, latents):
         """`WorldModel.latents` (N, ., 1) -> actions (N, L, d), the first of which acts. A search
         begins from the agents' own priors [D9] or from the last mean, shifted. Without a search
-        the priors act (L = 1; `check_settings` lets nothing else be planned so)."""
+        the priors act, L = 1 (`check_settings` then wants prior "own")."""
         own = self.config.prior == "own"
         first = self.model.prior(latents, self.mean.shape[1])[..., 0] if own else self.mean
         if not self.config.iterations:
