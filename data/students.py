@@ -333,8 +333,9 @@ def experts_table(rows):
 
 def printed_table(lines):
     """The method as printed, of more data or states, beside the expert's search; ± standard error
-    over episodes and over students, as if these were apart. lines: `by_line`'s. Markdown."""
-    found, levels = [], {}
+    over episodes and over students, as if these were apart. lines: `by_line`'s. Markdown, and
+    panels of each student's return against the transitions that it learned from."""
+    found, levels, panels = [], {}, {}
     for rows in lines.values():
         own = sum(rows.values(), [])
         if own[0]["expert_returns"]:
@@ -348,8 +349,17 @@ def printed_table(lines):
                       *([f"{x:.0f}" for x in known] or "--"), f"{level:.0f} ± {error:.0f}",
                       f"{level / known[0]:.2f}" if known else "-",
                       ranks(own) if own[0]["ranks"] else "-"])
+        curves, bound = panels.setdefault(task, ({}, None))
+        if not own[0]["ranks"]:
+            panels[task] = curves, max(level, bound or 0)
+            continue
+        about = json.loads(own[0]["settings"])
+        transitions = (fac.Replay(fac.data_file(task, "replay.npz")).transitions +
+                       about.get("expert_episodes", 0) * fac.EPISODE_STEPS)
+        models = "one model" if about.get("num_agents") == 1 else "a model for each joint"
+        curves.setdefault(models, {})[transitions] = by_episode(rows).mean(1).tolist()
     return markdown(["task", "what searches", "students", "expert", "its policy", "return", "kept",
-                     "rank of G, H = 0 / last"], found)
+                     "rank of G, H = 0 / last"], found), panels
 
 
 # --------------------------------------------------------------------- one thing changed at a time

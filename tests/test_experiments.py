@@ -1182,8 +1182,14 @@ def test_what_is_printed_stands_beside_what_its_search_can_get(tmp_path, monkeyp
                 "ranks": {"rank_correlation_returns": [0.5, 0.25]}} for seed in (102, 101)]
     write_rows(path := tmp_path / "printed.csv", [
         ("walker-run", 0, made[0]["case"], {}, [{**row, "minutes": 1.0} for row in rows]),
-        ("walker-run", 0, made[2]["case"], {}, student)])
+        ("walker-run", 0, made[2]["case"], {"expert_episodes": 1000}, student)])
+    monkeypatch.setattr(experiments, "draw_lines", lambda path, panels, *_, **__: found.update(
+        panels))
     _, text = experiments.report_printed("printed", path, tmp_path)
+    curves, bound = found["walker-run"]
+    known = fac.Replay(fac.data_file("walker-run", "replay.npz")).transitions
+    assert bound == 60 and curves == {"a model for each joint": {
+        known + 1000 * fac.EPISODE_STEPS: [40.0]}}
     bound, own = ([cell.strip() for cell in line.split("|")[1:-1]] for line in
                   text.splitlines()[2:])
     assert bound[3:] == ["80", "70", "60 ± 0", "0.75", "-"]
