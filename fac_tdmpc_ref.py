@@ -461,7 +461,7 @@ def heads_backward(model, tapes, d_shares, grads):
 
 
 def unroll_backward(model, tapes, actions, dx, grads):
-    """From the last h down add f_T's part to dx, and to `grads`; returns dz, summed over K."""
+    """Walk `unroll` back from dx: adds to dx and `grads`; returns dz (N, m, B), summed over K."""
     (L, _, B, K), n, m = actions.shape, model.config.num_agents, model.config.latent_dim
     for h in reversed(range(L - 1)):
         now, after = (slice(i * B * K, (i + 1) * B * K) for i in (h, h + 1))
@@ -657,14 +657,14 @@ def policy_rollout(model, z, noise):
 
 class AgentPlanner:
     """Plans for each of a model's agents from its own latent, networks, random stream and prior
-    alone: so processes that share the agents plan the same (Part II, which also has it faster)."""
+    alone: so processes that split them up plan the same (Part II, which also has it faster)."""
 
     def __init__(self, model, config):
         self.model, self.config = model, config
         self.reset()
 
     def reset(self, seeds=()):
-        """Start an episode, mean zero. seeds: a SeedSequence an agent; a first plan needs them."""
+        """Start an episode, mean zero. seeds: a SeedSequence an agent, needed by a first search."""
         sizes, L = self.model.config, 1 + self.config.horizon * (self.config.iterations > 0)
         self.mean = np.zeros((sizes.num_agents, L, sizes.agent_actions), F32)
         if seeds:

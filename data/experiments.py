@@ -75,11 +75,12 @@ def returns_of(model, task, planning, count, evaluation_seed, environment=None):
 # ------------------------------------------------- Figures 4, 5, 13 and sweeps: distillation
 
 def distil(task, seed, case, settings):
-    """Distil a student and teach it priors; a row for each evaluation seed: returns of its search,
-    `samples` and `iterations` around priors that know its plans (none is chosen by playing here),
-    beside those of its priors alone and of the expert's policy. settings: of DistillConfig, and
-    `num_agents`, `episodes`."""
+    """Distil a student and, but for TAP and [D9], teach it priors; a row for each evaluation seed:
+    returns of its search, `samples` and `iterations` around priors that know its plans (none is
+    chosen by playing here), beside those of its priors alone and of the expert's policy. settings:
+    of DistillConfig, and `num_agents`, `episodes`, `evaluation_seeds`."""
     num_agents, count = settings.pop("num_agents", None), settings.pop("episodes", 10)
+    evaluation_seeds = settings.pop("evaluation_seeds", students.EVALUATION_SEEDS)
     about = {k: settings.pop(k) for k in ("samples", "iterations") if k in settings}
     config = fac.from_dict(fac.DistillConfig, settings, f"{task}, {case}")
     expert, header = fac.load_model(fac.data_file(task, "expert.npz"))
@@ -103,7 +104,7 @@ def distil(task, seed, case, settings):
             row.update(rank_q=float(q[0]), rank_return=float(g[-1]))
     reflex, policy = (dataclasses.replace(of, prior="own", iterations=0)
                       for of in (planning, planning_for(header, {})))
-    for of in students.EVALUATION_SEEDS:
+    for of in evaluation_seeds:
         row.update(of_returns(returns_of(student, task, planning, count, of, environment), of))
         if expert.has_policy:
             found = returns_of(expert, task, policy, count, of)
@@ -312,7 +313,8 @@ def command_sweep(args):
         fac.DistillConfig(**{k: v for k, v in settings.items() if k != "num_agents"})
         for task in args.tasks:
             fac.ModelConfig(*fac.lookup_task(task), settings.get("num_agents", 1))
-    return distil_all(args, lambda task: [("sweep", settings) for settings in points])
+    return distil_all(args, lambda task: [  # what it chooses isn't reported on its own episodes
+        ("sweep", {**settings, "evaluation_seeds": [0]}) for settings in points])
 
 
 # ------------------------------------------------------------ Figures 7 and 8: planning
@@ -608,7 +610,9 @@ def settled(path, varied=(), whole=True):
              max(other for (t, _, c), other in have.items() if (t, c) == (task, case))]
     for task, seed, case in parts:
         print(f"{path}: {case} of {task}, seed {seed}, isn't whole: left out", file=sys.stderr)
-    return {key: own for key, own in rows.items() if key[:3] not in parts}
+    return {key: [*{(row["evaluation_seed"], row["step"], row["ms"]): row  # of a torn run the last
+                    for row in own if not row["error"]}.values()]
+            for key, own in rows.items() if key[:3] not in parts}
 
 
 def settled_rows(path, varied=()):
@@ -701,15 +705,18 @@ def report_figure8(_, path, figures):
     student keeps less the expert's and its policy's, with an interval; bars by dimension."""
     measured = {}  # {task: {case: {(kind, joint): returns (students, episodes)}}}
     for (task, _, case, settings), own in settled(path, VARIED["figure8"]).items():
-        about, played = json.loads(settings), [x for row in own for x in json.loads(row["returns"])]
+        about, played = json.loads(settings), sum((json.loads(row["returns"]) for row in own), [])
         measured.setdefault(task, {}).setdefault(case, {}).setdefault(
             (about.get("kind", "none"), about.get("joint", 0)), []).append(played)
     draw_bars(figures / "figure8.png", measured, KINDS)
     result, table = {}, []
     for task, cases in measured.items():
         both = set.intersection(*map(set, cases.values()))  # measured for all
-        kept = {case: {kind: kept_of(values, kind, sorted(j for k, j in both if k == kind))
-                       for kind in KINDS} for case, values in cases.items()}
+        joints = {kind: sorted(j for k, j in both if k == kind) for kind in ("none", *KINDS)}
+        if not all(joints.values()):
+            continue
+        kept = {case: {kind: kept_of(values, kind, joints[kind]) for kind in KINDS}
+                for case, values in cases.items()}
         result[task] = {case: {kind: found[0] for kind, found in own.items()}
                         for case, own in kept.items()}
         table += [(task, case, f"{np.mean(cases[case]['none', 0]):.0f}",
@@ -721,7 +728,7 @@ def report_figure8(_, path, figures):
 
 
 def report_alone(_, path, figures):
-    """Students whose joints have priors of their own, `students --out results/alone.csv`."""
+    """Students whose joints have priors of their own."""
     rows = settled_rows(path, VARIED["students"])
     short, table = students.alone_tables(students.by_line(rows), AUTHORS)
     return {"runs": len(rows)}, f"{short}\n{table}"
@@ -759,14 +766,15 @@ def report_printed(_, path, figures):
 REPORT_HEAD = """# The paper's figures, here
 
 Written by `python data/experiments.py report` from the CSVs beside it; README.md says what they
-show. Returns are means over students and episodes of evaluation seeds 101 and 102, ± standard
-error over both; G's rank correlation is of 256 held-out states; every run's settings are in its
-CSV. Figure 7's budgets are chosen by every other episode, returns are of the others; figure 8's
-intervals are of 95% of a bootstrap over episodes and joints, bold without 0 in them; figure 12's
-ratio is one of means. '10% TD-MPC' has hidden layers of 66 (B.2), which with Table
-2's latents of 50 is 3% of the weights behind the encoder; six agents have 26%. One agent's layers
-are as wide as its expert's, N agents' an Nth of that; latents are of 50 an agent. Minutes are of a
-core while others distil beside it.
+show. Returns are means over students and episodes, but for figure 7 of evaluation seeds 101 and
+102, ± standard error over both (figure 12: deviation over seeds). TAP and [D9] search from the last
+plan, what else is changed around priors that know its plans. G's rank correlation is of 256
+held-out states; every run's settings are in its CSV. Figure 7's budgets are chosen by every other
+episode, returns are of the others; figure 8's intervals are of 95% of a bootstrap over episodes and
+joints, bold without 0 in them; figure 12's ratio is one of means. '10% TD-MPC' has hidden layers of
+66 (B.2), which with Table 2's latents of 50 is 3% of the weights behind the encoder; six agents
+have 26%. One agent's layers are as wide as its expert's, N agents' an Nth of that; latents are of
+50 an agent. Minutes are of a core while others distil beside it.
 
 """
 REPORTS = {"alone": report_alone, "capacity": report_capacity, "experts": report_experts,
@@ -836,8 +844,8 @@ def make_parser():
     budget = {"steps": fac.DistillConfig.steps, "episodes": 10}
     shipped = [task for task in sorted(fac.TASKS) if (fac.EXPERTS / task / "expert.npz").exists()]
     add_cases("figure4", distil_and_time, FIGURE4, "Section 5.2: Fac-TDMPC, TD-MPC in Table 2's "
-              "size and the small one of B.2, and TAP, by Algorithm 1; return against steps, then "
-              "milliseconds (keep the machine quiet for these).", shipped)
+              "size and the small one of B.2, and TAP: returns of searches, of priors alone and of "
+              "the policy, then milliseconds (keep the machine quiet for these).", shipped)
     add_cases("figure5", distil_all, FIGURE5, "Section 5.3: KL against MSE (and without "
               "credit), the perturbations' deviation (clipped), the student's temperature, a "
               "consistency loss.", walkers)

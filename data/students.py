@@ -137,7 +137,8 @@ def mean_and_spread(values, spread, digits=0):
 
 def returns(row, key="returns"):
     """A row's returns: the student's, or what else `distill` compares; []: not there."""
-    return json.loads(row[key]) if key in row else json.loads(row["ranks"]).get(key, [])
+    return (json.loads(row[key] or "[]") if key in row else
+            json.loads(row["ranks"] or "{}").get(key, []))
 
 
 def overall(rows, key):
@@ -191,7 +192,7 @@ def line_of(row):
 def by_line(rows):
     """{line: {evaluation seed, lowest first: rows by seed}}."""
     found = {}
-    for row in sorted(rows, key=lambda row: int(row["evaluation_seed"])):
+    for row in sorted(rows, key=lambda row: (int(row["evaluation_seed"]), int(row["seed"]))):
         found.setdefault(line_of(row), {}).setdefault(int(row["evaluation_seed"]), []).append(row)
     return {line: found[line] for line in dict.fromkeys(map(line_of, rows))}
 
@@ -357,6 +358,7 @@ def printed_table(lines):
         transitions = (fac.Replay(fac.data_file(task, "replay.npz")).transitions +
                        about.get("expert_episodes", 0) * fac.EPISODE_STEPS)
         models = "one model" if about.get("num_agents") == 1 else "a model for each joint"
+        models += ", {steps} x {batch_size}".format_map(about)
         curves.setdefault(models, {})[transitions] = by_episode(rows).mean(1).tolist()
     return markdown(["task", "what searches", "students", "expert", "its policy", "return", "kept",
                      "rank of G, H = 0 / last"], found), panels
@@ -365,33 +367,47 @@ def printed_table(lines):
 # --------------------------------------------------------------------- one thing changed at a time
 
 def variants_table(lines, ms):
-    """Students of which one thing is changed, by a search around priors that know its plans and by
-    these alone; the search's return less the default students' in the same episodes. lines:
-    `by_line`'s; ms: {(task, case): milliseconds}. Result {task: {case: ...}}, Markdown, panels."""
-    result, found, panels, default = {}, [], {}, {}
+    """Students of which one thing is changed, by their search (but for TAP and [D9] around priors
+    that know its plans) and by their priors alone; the search's return less the default students'
+    of the same seeds in the same episodes. lines: `by_line`'s; ms: {(task, case): milliseconds}.
+    Result {task: {case: ...}}, Markdown, panels."""
+    groups, result, found, panels = {}, {}, [], {}
     for rows in lines.values():
-        first = rows[min(rows)]
-        task, case = first[0]["task"], first[0]["case"]
-        own, policy = by_episode(rows), by_episode(rows, lambda row: returns(row, "policy_returns"))
-        if case == "default":
-            default[task] = own
-        about = {"students": len(first), "search": own.mean(), "policy": policy.mean(),
-                 "above_default": mean_and_error(own - default[task])
-                 if own.shape == np.shape(default.get(task)) else None}
-        dots = panels.setdefault(task, {})[case] = {"its search": mean_and_error(own - policy)}
-        if all(returns(row, "reflex_returns") for row in first):
-            alone = by_episode(rows, lambda row: returns(row, "reflex_returns"))
-            about.update(priors=alone.mean(), search_wins=mean_and_error(own - alone))
-            dots["priors alone"] = mean_and_error(alone - policy)
-        h0, last = (np.mean([float(row[key] or "nan") for row in first])
-                    for key in ("rank_q", "rank_return"))
-        result.setdefault(task, {})[case] = about
-        above, wins = ("{:+.0f} ± {:.0f}".format(*of) if (of := about.get(key)) else "-"
-                       for key in ("above_default", "search_wins"))
-        found.append([task, case, len(first), f"{policy.mean():.0f}", f"{own.mean():.0f}", above,
-                      f"{about['priors']:.0f}" if "priors" in about else "-", wins,
-                      f"{h0:.2f} / {last:.2f}" if np.isfinite(last) else "-",
-                      f"{ms[task, case]:.1f}" if (task, case) in ms else "-"])
+        own = {row["seed"]: [] for row in rows[min(rows)]}
+        for row in sum(rows.values(), []):
+            own[row["seed"]].append(row)
+        groups.setdefault(rows[min(rows)][0]["task"], {})[rows[min(rows)][0]["case"]] = own
+
+    def by_student(own, key="returns", seeds=()):  # (students, episodes)
+        return np.array([sum((returns(row, key) for row in own[seed]), [])
+                         for seed in seeds or own])
+
+    for task, cases in groups.items():
+        default = cases.get("default", {})
+        for case in sorted(cases, key=lambda case: (case != "default", case)):
+            own, policy = cases[case], by_student(cases[case], "policy_returns")
+            search, reflex = by_student(own), by_student(own, "reflex_returns")
+            about = {"students": len(own), "search": search.mean()}
+            if shared := [seed for seed in own if seed in default]:
+                about["above_default"] = mean_and_error(by_student(own, seeds=shared) -
+                                                        by_student(default, seeds=shared))
+            dots = panels.setdefault(task, {}).setdefault(case, {})
+            if reflex.size:
+                about.update(priors=reflex.mean(), search_wins=mean_and_error(search - reflex))
+            for name, of in (("its search", search), ("priors alone", reflex)):
+                if of.size and policy.size:
+                    dots[name] = mean_and_error(of - policy)
+            first = [rows[0] for rows in own.values()]
+            h0, last = (np.mean([float(row[key] or "nan") for row in first])
+                        for key in ("rank_q", "rank_return"))
+            result.setdefault(task, {})[case] = about
+            above, wins = ("{:+.0f} ± {:.0f}".format(*of) if (of := about.get(key)) else "-"
+                           for key in ("above_default", "search_wins"))
+            found.append([task, case, len(own), f"{policy.mean():.0f}" if policy.size else "-",
+                          f"{search.mean():.0f}", above,
+                          f"{reflex.mean():.0f}" if reflex.size else "-", wins,
+                          f"{h0:.2f} / {last:.2f}" if np.isfinite(last) else "-",
+                          f"{ms[task, case]:.1f}" if (task, case) in ms else "-"])
     return result, markdown(["task", "students", "number", "policy", "its search",
                              "less the default's", "priors alone", "search - priors",
                              "rank of G, H = 0 / last", "ms"], found), panels

@@ -1,7 +1,7 @@
 """What `experiments.py report` says and draws: statistics, Markdown, lines.
 
-Over seeds ± is the sample deviation (n - 1); of one seed's episodes it is the deviation of just
-these returns (n). A ratio is one of means, never a mean of ratios.
+Here ± is the sample deviation over seeds (n - 1); students.py's is a standard error. A ratio is one
+of means, never a mean of ratios.
 """
 import csv
 import itertools
@@ -57,8 +57,7 @@ def cell(found):
         return "-"
     rank = f", {found['rank_return']:.2f}" if "rank_return" in found else ""
     spread = f" ± {found['std']:.0f} ({found['seeds']})" if found["seeds"] > 1 else ""
-    ms = f", {found['ms']:.1f} / {found['ms_workers']:.1f} ms" if "ms" in found else ""
-    return f"{found['mean']:.0f}{spread}{rank}{ms}"
+    return f"{found['mean']:.0f}{spread}{rank}"
 
 
 def draw_lines(path, panels, xlabel, ylabel="episode return", **axes):
@@ -67,7 +66,7 @@ def draw_lines(path, panels, xlabel, ylabel="episode return", **axes):
     plt = plots.pyplot()
     labels = list(dict.fromkeys(label for lines, _ in panels.values() for label in lines))
     cycle, columns = list(plt.rcParams["axes.prop_cycle"]), min(4, len(panels))
-    alike, handles = len(labels) <= len(cycle), {}  # one style for a label in all panels?
+    handles = {}
     figure, grid = plt.subplots(-(-len(panels) // columns), columns, squeeze=False,
                                 figsize=(3.6 * columns, 3.8 * -(-len(panels) // columns)),
                                 layout="constrained")
@@ -76,9 +75,8 @@ def draw_lines(path, panels, xlabel, ylabel="episode return", **axes):
         if lines is None:
             ax.remove()
             continue
-        order = labels if alike else list(lines)  # one style, one line
         for label, points in lines.items():
-            style = cycle[order.index(label) % len(cycle)]
+            style = cycle[labels.index(label) % len(cycle)]  # the same in all panels
             x = sorted(points)
             mean, std = (np.array([f(points[v]) for v in x]) for f in (np.mean, deviation))
             ax.plot(x, mean, marker=".", label=label, **style)
@@ -93,22 +91,22 @@ def draw_lines(path, panels, xlabel, ylabel="episode return", **axes):
             ax.minorticks_off()
         else:
             ax.locator_params("x", nbins=5)
-        if not alike:
-            ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, fontsize=8)
         handles.update((label, handle) for handle, label in zip(*ax.get_legend_handles_labels()))
-    if alike:
-        figure.legend(handles.values(), handles, loc="outside lower center", fontsize=8,
-                      ncols=2 * columns)
+    figure.legend(handles.values(), handles, loc="outside lower center", fontsize=8,
+                  ncols=2 * columns)
     plots.drawn(plots.save_figure, path, figure)
 
 
 def draw_dots(path, panels, xlabel):
     """A panel each {title: {case: {label: (mean, error)}}}: a line for a case, a dot a label."""
-    plt = plots.pyplot()
-    rows = max(map(len, panels.values()))
-    figure, grid = plt.subplots(1, len(panels), squeeze=False, layout="constrained",
-                                figsize=(1 + 4.5 * len(panels), 1.5 + 0.28 * rows))
-    for ax, (title, cases) in zip(grid[0], panels.items()):
+    plt, handles = plots.pyplot(), {}
+    columns, height = min(3, len(panels)), 1.5 + 0.28 * max(map(len, panels.values()))
+    figure, grid = plt.subplots(-(-len(panels) // columns), columns, squeeze=False,
+                                figsize=(1 + 4.5 * columns, height * -(-len(panels) // columns)),
+                                layout="constrained")
+    for ax in grid.flat[len(panels):]:
+        ax.remove()
+    for ax, (title, cases) in zip(grid.flat, panels.items()):
         labels = list(dict.fromkeys(label for found in cases.values() for label in found))
         for i, (label, style) in enumerate(zip(labels, plt.rcParams["axes.prop_cycle"])):
             at = [y for y, found in enumerate(cases.values()) if label in found]
@@ -118,7 +116,8 @@ def draw_dots(path, panels, xlabel):
         ax.axvline(0, color="black", linewidth=0.8)
         ax.set(title=title, xlabel=xlabel, yticks=range(len(cases)), yticklabels=cases)
         ax.invert_yaxis()
-    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        handles.update((label, handle) for handle, label in zip(*ax.get_legend_handles_labels()))
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=3)
     plots.drawn(plots.save_figure, path, figure)
 
 
@@ -200,12 +199,15 @@ def kept_of(values, kind, joints):
     episodes = rng.integers(len(whole), size=(DRAWS, len(whole)))
     drawn = rng.integers(len(joints), size=(DRAWS, len(joints)))
     means = np.mean(np.array(parts)[drawn[..., None], episodes[:, None]], (1, 2))
-    return np.mean(parts) / whole.mean(), means / whole[episodes].mean(1)
+    with np.errstate(all="ignore"):  # nothing to keep
+        return np.mean(parts) / whole.mean(), means / whole[episodes].mean(1)
 
 
 def difference_cell(one, other):
     """What one keeps less what another does and where 95% of draws lie (low to high); bold if that
     leaves out 0. Both: `kept_of`'s, of as many episodes."""
+    if not np.isfinite([*one[1], *other[1]]).all():
+        return "-"
     low, high = np.percentile(one[1] - other[1], (2.5, 97.5))
     mean, low, high = (round(float(x), 2) + 0.0 for x in (one[0] - other[0], low, high))  # no -0.00
     text = f"{mean:+.2f} ({low:+.2f} to {high:+.2f})"
@@ -226,10 +228,11 @@ def draw_bars(path, cells, kinds):
                 ax.bar(np.array(joints) + 0.27 * (i - 1),
                        [np.mean(values[kind, j]) for j in joints], 0.25, label=case,
                        color=f"C{i}", hatch=("", "//", "..")[i], edgecolor="black")
-                ax.axhline(np.mean(values["none", 0]), color=f"C{i}",
-                           linestyle=("-", "--", ":")[i])
+                if ("none", 0) in values:
+                    ax.axhline(np.mean(values["none", 0]), color=f"C{i}",
+                               linestyle=("-", "--", ":")[i])
             what = "one action is noise" if kind == "noise" else f"one motor x {kind}"
             ax.set(title=f"{task}: {what}", xlabel="action dimension", ylabel="episode return",
                    xticks=range(0, actions, 1 + actions // 20))
-    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     plots.drawn(plots.save_figure, path, figure)

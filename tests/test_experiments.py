@@ -177,7 +177,7 @@ def test_a_killed_sweep_goes_on_and_makes_no_run_twice(tmp_path):
     result = last_json(run(*flags, "--json", cwd=tmp_path))
     assert result == {"out": "sweep.csv", "runs": 4, "now": 4 - len(before), "failed": 0}
     after = rows_of(path)
-    assert len(after) == 4 and all(len(rows) == 2 for rows in after.values())
+    assert len(after) == 4 and all(len(rows) == 1 for rows in after.values())
     assert {k: after[k] for k in before} == before
     result = last_json(here(*flags, "--json", cwd=tmp_path))
     assert result["now"] == 0 and rows_of(path) == after
@@ -191,7 +191,7 @@ def test_a_failed_run_is_a_row_and_is_tried_again(tmp_path):
         assert json.loads(done.stdout.splitlines()[-1])["failed"] == 1
     rows = experiments.read_rows(tmp_path / "sweep.csv")
     assert ["allocate" in row["error"] for row in rows].count(True) == 2
-    assert len(rows) == 4 and len(rows_of(tmp_path / "sweep.csv")) == 1
+    assert len(rows) == 3 and len(rows_of(tmp_path / "sweep.csv")) == 1
 
 
 def seven_but_one_dies(task, seed, case, settings):
@@ -842,11 +842,12 @@ def test_runs_of_other_settings_don_t_make_one_figure(tmp_path, capsys, case, se
     assert "walker-run is of other data or defaults than now" in capsys.readouterr().err
 
 
-def variant_row(evaluation_seed, search, priors=None, policy=(10.0, 30.0), **more):
-    """A row as `distil` makes it."""
+def variant_row(evaluation_seed, search, priors=None, **more):
+    """A row as `distil` makes it; without priors TAP's, which has no ranks."""
     return {"step": 9, **tables.of_returns(search, evaluation_seed), "minutes": 1.0,
-            "policy_returns": policy, "rank_q": 0.9, "rank_return": 0.5,
-            "ranks": {"reflex_returns": priors} if priors else {}, **more}
+            "policy_returns": [10.0, 30.0], **({
+                "rank_q": 0.9, "rank_return": 0.5, "ranks": {"reflex_returns": priors}}
+                if priors else {}), **more}
 
 
 def test_a_report_needs_no_expert(tmp_path, monkeypatch):
@@ -855,10 +856,11 @@ def test_a_report_needs_no_expert(tmp_path, monkeypatch):
         *(("walker-stand", seed, case, {"data": [1]}, [
             variant_row(102, [40.0 + seed - less, 60.0], [10.0, 20.0]),
             variant_row(101, [50.0 - less, 70.0 + seed], [20.0, 30.0])])
-          for case, less in (("default", 0), ("MSE", 8)) for seed in (0, 1)),
-        ("walker-stand", 0, "TAP", {"data": [1]}, [
-            variant_row(101, [1.0, 2.0], rank_q="", rank_return=""),
-            variant_row(102, [3.0, 4.0], rank_q="", rank_return="")]),
+          for case, less, seeds in (("MSE", 8, (1, 0, 2)), ("default", 0, (0, 1)))
+          for seed in seeds),  # whichever ended first
+        ("walker-stand", 0, "TAP", {"data": [1]}, [{"error": "it failed before"}]),
+        ("walker-stand", 0, "TAP", {"data": [1]}, [variant_row(101, [1.0, 2.0]),
+                                                   variant_row(102, [3.0, 4.0])]),
         ("walker-stand", 0, "default", {"data": [1]}, [{"ms": 2.5, "ms_workers": 1.0}])])
     monkeypatch.setattr(fac, "EXPERTS", tmp_path)
     monkeypatch.setattr(experiments, "draw_dots", lambda path, panels, _: drawn.update(panels))
@@ -868,9 +870,9 @@ def test_a_report_needs_no_expert(tmp_path, monkeypatch):
                          for line in text.splitlines()[2:])
     assert default == ["walker-stand", "default", "2", "20", "55", "+0 ± 0", "20",
                        "+35 ± 3", "0.90 / 0.50", "2.5"]
-    # -8, 0, -8, 0 in both seeds: a standard error of 2.3 over episodes, none over seeds
-    assert mse[3:7] == ["20", "51", "-4 ± 2", "20"] and mse[-1] == "-"
-    assert tap == ["walker-stand", "TAP", "1", "20", "2", "-", "-", "-", "-", "-"]
+    # -8, 0, -8, 0 in both seeds that are compared: an error of 2.3 over episodes, none over seeds
+    assert mse[2:7] == ["3", "20", "52", "-4 ± 2", "20"] and mse[-1] == "-"
+    assert tap == ["walker-stand", "TAP", "1", "20", "2", "-52 ± 6", "-", "-", "-", "-"]
     assert result["walker-stand"]["MSE"]["above_default"] == pytest.approx((-4, (64 / 12) ** 0.5))
     assert {case: [*dots] for case, dots in drawn["walker-stand"].items()} == {
         "default": ["its search", "priors alone"], "MSE": ["its search", "priors alone"],
@@ -998,6 +1000,8 @@ def test_an_interval_is_as_wide_as_episodes_and_joints_scatter():
     assert kept(lucky, lucky)[2].tolist() == [0, 0]  # the same episodes are drawn for both
     mean, _, (low, high) = kept(lucky, steady)
     assert mean == 0.6 and -0.4 < low < -0.1 < 0.1 < high < 0.4
+    nothing = tables.kept_of({key: [[0.0] * 5] for key in steady}, "noise", [0, 1])
+    assert tables.difference_cell(nothing, nothing) == "-"
     # students: their mean is an episode's
     one, _ = tables.kept_of({key: [[90.0] * 3, [110.0] * 3] if key[0] == "none" else [
         [30.0] * 3, [50.0] * 3] for key in steady}, "noise", [0, 1])
@@ -1041,7 +1045,9 @@ def test_report_draws_what_the_csvs_hold(tmp_path):
         {"return_mean": value, "returns": [value], "minutes": 1.0},
         {"return_mean": value, "returns": [value]}]) for case in ("expert", "policy", "student")
         for about, value in (({}, 9.0), *(({"joint": j, "kind": kind}, 3.5 + 2 * j)
-                                          for j in (0, 1) for kind in ("noise", "0.5", "1.5")))])
+                                          for j in (0, 1) for kind in ("noise", "0.5", "1.5")))] + [
+        ("fish-swim", 0, "policy", {"joint": 0, "kind": "noise"}, [  # what isn't there yet
+            {"return_mean": 3.0, "returns": [3.0], "minutes": 1.0}])])
     write_rows(tmp_path / "figure7.csv", [("walker-run", 0, case, {"samples": s, "iterations": i}, [
         {"return_mean": value, "returns": [value] * 2, "minutes": 1.0},
         {"ms": ms, "ms_workers": ms / 2}])
@@ -1054,6 +1060,7 @@ def test_report_draws_what_the_csvs_hold(tmp_path):
     assert found["figure12"]["walker-walk"]["expert"]["mean"] == 6.0
     assert found["figure12"]["walker-walk"]["ratio"] == 5 / 6
     assert found["figure8"]["walker-run"]["student"] == {"noise": 0.5, "0.5": 0.5, "1.5": 0.5}
+    assert [*found["figure8"]] == ["walker-run"]
     (row,) = found["figure7"]
     assert row["task"] == "walker-run" and row["ratio"] == 6.0 and row["ratio_in_process"] == 3.0
     assert row["expert"] == {"samples": 64, "iterations": 6, "ms": 12.0, "return": 96.0}
@@ -1182,13 +1189,14 @@ def test_what_is_printed_stands_beside_what_its_search_can_get(tmp_path, monkeyp
                 "ranks": {"rank_correlation_returns": [0.5, 0.25]}} for seed in (102, 101)]
     write_rows(path := tmp_path / "printed.csv", [
         ("walker-run", 0, made[0]["case"], {}, [{**row, "minutes": 1.0} for row in rows]),
-        ("walker-run", 0, made[2]["case"], {"expert_episodes": 1000}, student)])
+        ("walker-run", 0, made[2]["case"], {"expert_episodes": 1000, "steps": 9,
+                                            "batch_size": 64}, student)])
     monkeypatch.setattr(experiments, "draw_lines", lambda path, panels, *_, **__: found.update(
         panels))
     _, text = experiments.report_printed("printed", path, tmp_path)
     curves, bound = found["walker-run"]
     known = fac.Replay(fac.data_file("walker-run", "replay.npz")).transitions
-    assert bound == 60 and curves == {"a model for each joint": {
+    assert bound == 60 and curves == {"a model for each joint, 9 x 64": {
         known + 1000 * fac.EPISODE_STEPS: [40.0]}}
     bound, own = ([cell.strip() for cell in line.split("|")[1:-1]] for line in
                   text.splitlines()[2:])
