@@ -759,7 +759,7 @@ def report_printed(_, path, figures):
     rows = settled_rows(path, VARIED["printed"])
     text, panels = students.printed_table(students.by_line(rows))
     draw_lines(figures / "printed.png", panels, "transitions learned from (the paper: 10^6)",
-               xscale="log", xlim=(1e4, 1.2e6))
+               "return (expert: without its policy)", xscale="log", xlim=(1e4, 1.2e6))
     return {"runs": len(rows)}, text
 
 
