@@ -60,16 +60,19 @@ def run_all(args, function, runs):
                     getattr(args, "scheduler", None))
 
 
+ALONE = {"prior": "own", "iterations": 0}  # of a PlannerConfig: a policy, or priors, act
+
+
 def planning_for(header, about):
     """A model's own planning but for what a run's settings say of it."""
     own = {k: about[k] for k in ("horizon", *fac.STUDENT_PLANNING) if k in about}
     return fac.PlannerConfig(**{**fac.made_for(header, "model"), **own})
 
 
-def returns_of(model, task, planning, count, evaluation_seed, environment=None):
-    """The returns of `count` episodes, played in this process."""
-    return fac.play(model, task, planning, fac.episode_seeds(evaluation_seed, count), 0,
-                    "evaluating", environment)[2].sum(1)
+def measure(model, task, planning, count, evaluation_seed, environment=None):
+    """A row's columns of the returns of `count` episodes, played in this process."""
+    return of_returns(fac.play(model, task, planning, fac.episode_seeds(evaluation_seed, count), 0,
+                               "evaluating", environment)[2].sum(1), evaluation_seed)
 
 
 # ------------------------------------------------- Figures 4, 5, 13 and sweeps: distillation
@@ -102,15 +105,15 @@ def distil(task, seed, case, settings):
         if not environment:  # others' ranks are of the robot's actions
             q, g = distiller.ranks(256, planning.discount)
             row.update(rank_q=float(q[0]), rank_return=float(g[-1]))
-    reflex, policy = (dataclasses.replace(of, prior="own", iterations=0)
+    reflex, policy = (dataclasses.replace(of, **ALONE)
                       for of in (planning, planning_for(header, {})))
     for of in evaluation_seeds:
-        row.update(of_returns(returns_of(student, task, planning, count, of, environment), of))
+        row.update(measure(student, task, planning, count, of, environment))
         if expert.has_policy:
-            found = returns_of(expert, task, policy, count, of)
-            row["policy_returns"] = np.round(found, 3).tolist()
+            row["policy_returns"] = measure(expert, task, policy, count, of)["returns"]
         if planning.prior == "own":
-            row["ranks"] = {"reflex_returns": returns_of(student, task, reflex, count, of).tolist()}
+            found = measure(student, task, reflex, count, of)["returns"]
+            row["ranks"] = {"reflex_returns": found}
         yield {**row}
 
 
@@ -248,8 +251,7 @@ def printed(task, seed, case, settings, folder):
     planning = fac.PlannerConfig(**{**fac.made_for(header, "expert"), "pi_trajs": 0,
                                     "samples": samples, "iterations": iterations})
     for evaluation_seed in students.EVALUATION_SEEDS:
-        yield of_returns(fac.evaluate(expert, task, planning, settings["episodes"],
-                                      evaluation_seed, 0)["returns"], evaluation_seed)
+        yield measure(expert, task, planning, settings["episodes"], evaluation_seed)
 
 
 def command_printed(args):
@@ -373,12 +375,11 @@ def plan_with(task, seed, case, settings, folder):
     model, header = load_same(task, seed, case, settings, folder)
     planning = planning_for(header, settings)
     if case == "policy":
-        planning = dataclasses.replace(planning, prior="own", iterations=0)
+        planning = dataclasses.replace(planning, **ALONE)
     environment = (DisturbedEnvironment(task, settings["joint"], settings["kind"],
                                         planning.action_repeat) if settings.get("kind") else None)
     for evaluation_seed in students.EVALUATION_SEEDS:
-        yield of_returns(returns_of(model, task, planning, settings["episodes"], evaluation_seed,
-                                    environment), evaluation_seed)
+        yield measure(model, task, planning, settings["episodes"], evaluation_seed, environment)
 
 
 KINDS = ("noise", "0.5", "1.5")  # an action is noise; its motor's strength
@@ -475,14 +476,13 @@ def plan_like_authors(task, seed, case, settings, folder):
     times = student.config.num_agents if sharp else 1  # heads are summed here, averaged there
     planning = fac.PlannerConfig(**own, pi_trajs=proposals, output=output, inverse_temperature=(
         times * fac.PlannerConfig.inverse_temperature))
-    reflex = fac.PlannerConfig(**{**fac.made_for(theirs, "expert"), "prior": "own",
-                                  "iterations": 0})
+    policy = fac.PlannerConfig(**{**fac.made_for(theirs, "expert"), **ALONE})
     for evaluation_seed in students.EVALUATION_SEEDS:
-        found = fac.evaluate(expert, task, reflex, settings["episodes"], evaluation_seed, 0)
+        found = measure(expert, task, policy, settings["episodes"], evaluation_seed)
         with AuthorsPlanner(student, expert, planning) as planner:
             played = returns_by(planner, task, settings["episodes"], evaluation_seed)
         yield {**of_returns(played, evaluation_seed),
-               "policy_returns": np.round(found["returns"], 3).tolist()}
+               "policy_returns": found["returns"]}
 
 
 def returns_by(planner, task, episodes, evaluation_seed):
@@ -632,7 +632,7 @@ def curves(rows, column="return_mean"):
 
 def report_variants(_, path, figures):
     """Figures 4, 5 and 13, and departures: students of which one thing is changed."""
-    rows = [row for own in settled(path).values() for row in own]
+    rows = settled_rows(path)
     ms = {(row["task"], row["case"]): float(row["ms"]) for row in rows if row["ms"]}  # of one seed
     result, text, panels = students.variants_table(students.by_line(
         [row for row in rows if row["return_mean"]]), ms)

@@ -32,7 +32,6 @@ from tdmpc2 import Checkpoint  # noqa: E402
 
 MOST_ACTIONS = 6  # of the paper's robots here
 MARKS = (0.1, 0.3, 1.0)  # shares of the steps after which Figure 10's students play
-ALONE = {"prior": "own", "iterations": 0}  # of a PlannerConfig: what the policy says
 
 
 def named(tasks):
@@ -93,7 +92,7 @@ def collect(checkpoint, task, episodes, seed, folder):
              "versions": fac.software()}
     path = folder / f"collected-{experiments.crc(about):08x}" / task / "replay.npz"
     if not path.exists():
-        planning = fac.PlannerConfig(**ALONE)
+        planning = fac.PlannerConfig(**experiments.ALONE)
         path.parent.mkdir(parents=True, exist_ok=True)
         import_expert.collect(checkpoint.teacher(task), planning, fac.make_robot(task), episodes,
                               seed)[0].write(path, {**about, "task": task})
@@ -222,7 +221,7 @@ def command_evaluate(args):
                                                          args.seed, args.workers)
         found[task]["policy_returns"] = teacher_returns(
             expert, own, path, args.episodes, args.seed, args.workers,
-            **ALONE) if expert.has_policy else []
+            **experiments.ALONE) if expert.has_policy else []
         found[task]["kept"] = fac.return_kept(*(np.mean(found[task][key]) for key in (
             "returns", "teacher_returns")))
     rows = [[np.mean(of[key]) if of[key] else np.nan for key in (
@@ -295,7 +294,7 @@ def play_marks(task, seed, case, settings, folder, data):
     own = fac.made_for(header, path)
     if case in (TEACHER, POLICY):
         returns = teacher_returns(expert, header, path, episodes, 0,
-                                  **(ALONE if case == POLICY else {}))
+                                  **(experiments.ALONE if case == POLICY else {}))
         yield {"step": steps, **experiments.of_returns(returns, 0)}
     else:
         planning = fac.PlannerConfig(**{**own, "horizon": settings["horizon"], **(
@@ -307,8 +306,8 @@ def play_marks(task, seed, case, settings, folder, data):
                 q, g = ranks_of(student, load_path(task, data, "replay.npz"), about,
                                 planning.discount)
                 ranks = {"rank_q": float(q[0]), "rank_return": float(g[-1])}
-            yield {"step": step, **ranks, **experiments.of_returns(
-                experiments.returns_of(student, task, planning, episodes, 0), 0)}
+            yield {"step": step, **ranks,
+                   **experiments.measure(student, task, planning, episodes, 0)}
 
 
 def ranks_of(student, replay, header, discount):

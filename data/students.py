@@ -337,6 +337,8 @@ def printed_table(lines):
     over episodes and over students, as if these were apart. lines: `by_line`'s. Markdown, and
     panels of each student's return against the transitions that it learned from."""
     found, levels, panels = [], {}, {}
+    recorded = functools.cache(
+        lambda task: fac.Replay(fac.data_file(task, "replay.npz")).transitions)
     for rows in lines.values():
         own = sum(rows.values(), [])
         if own[0]["expert_returns"]:
@@ -355,8 +357,7 @@ def printed_table(lines):
             panels[task] = curves, max(level, bound or 0)
             continue
         about = json.loads(own[0]["settings"])
-        transitions = (fac.Replay(fac.data_file(task, "replay.npz")).transitions +
-                       about.get("expert_episodes", 0) * fac.EPISODE_STEPS)
+        transitions = recorded(task) + about.get("expert_episodes", 0) * fac.EPISODE_STEPS
         models = "one model" if about.get("num_agents") == 1 else "a model for each joint"
         models += ", {steps} x {batch_size}".format_map(about)
         curves.setdefault(models, {})[transitions] = by_episode(rows).mean(1).tolist()
@@ -373,37 +374,37 @@ def variants_table(lines, ms):
     Result {task: {case: ...}}, Markdown, panels."""
     groups, result, found, panels = {}, {}, [], {}
     for rows in lines.values():
-        own = {row["seed"]: [] for row in rows[min(rows)]}
-        for row in sum(rows.values(), []):
-            own[row["seed"]].append(row)
-        groups.setdefault(rows[min(rows)][0]["task"], {})[rows[min(rows)][0]["case"]] = own
+        first = rows[min(rows)]
+        groups.setdefault(first[0]["task"], {})[first[0]["case"]] = rows
 
-    def by_student(own, key="returns", seeds=()):  # (students, episodes)
-        return np.array([sum((returns(row, key) for row in own[seed]), [])
-                         for seed in seeds or own])
+    def of_seeds(rows, seeds):
+        return by_episode({at: [row for row in own if row["seed"] in seeds]
+                           for at, own in rows.items()})
 
     for task, cases in groups.items():
         default = cases.get("default", {})
+        known = {row["seed"] for own in default.values() for row in own}
         for case in sorted(cases, key=lambda case: (case != "default", case)):
-            own, policy = cases[case], by_student(cases[case], "policy_returns")
-            search, reflex = by_student(own), by_student(own, "reflex_returns")
-            about = {"students": len(own), "search": search.mean()}
-            if shared := [seed for seed in own if seed in default]:
-                about["above_default"] = mean_and_error(by_student(own, seeds=shared) -
-                                                        by_student(default, seeds=shared))
+            first = cases[case][min(cases[case])]
+            search, policy, reflex = (
+                by_episode(cases[case], lambda row, key=key: returns(row, key))
+                for key in ("returns", "policy_returns", "reflex_returns"))
+            about = {"students": len(first), "search": search.mean()}
+            if shared := known & {row["seed"] for row in first}:
+                about["above_default"] = mean_and_error(of_seeds(cases[case], shared) -
+                                                        of_seeds(default, shared))
             dots = panels.setdefault(task, {}).setdefault(case, {})
             if reflex.size:
                 about.update(priors=reflex.mean(), search_wins=mean_and_error(search - reflex))
             for name, of in (("its search", search), ("priors alone", reflex)):
                 if of.size and policy.size:
                     dots[name] = mean_and_error(of - policy)
-            first = [rows[0] for rows in own.values()]
             h0, last = (np.mean([float(row[key] or "nan") for row in first])
                         for key in ("rank_q", "rank_return"))
             result.setdefault(task, {})[case] = about
             above, wins = ("{:+.0f} ± {:.0f}".format(*of) if (of := about.get(key)) else "-"
                            for key in ("above_default", "search_wins"))
-            found.append([task, case, len(own), f"{policy.mean():.0f}" if policy.size else "-",
+            found.append([task, case, len(first), f"{policy.mean():.0f}" if policy.size else "-",
                           f"{search.mean():.0f}", above,
                           f"{reflex.mean():.0f}" if reflex.size else "-", wins,
                           f"{h0:.2f} / {last:.2f}" if np.isfinite(last) else "-",

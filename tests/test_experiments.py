@@ -441,9 +441,9 @@ def test_a_run_is_distilled_as_it_says(monkeypatch):
 def test_a_departure_s_student_searches_around_its_priors_but_for_d9(monkeypatch, case, settings,
                                                                     prior):
     planned = []
-    monkeypatch.setattr(experiments, "returns_of", lambda model, task, planning, *_: (
+    monkeypatch.setattr(experiments, "measure", lambda model, task, planning, *_: (
         planned.append((model.config.num_agents, planning.prior, planning.iterations)),
-        fac.Planner(model, planning).close(), np.zeros(1))[2])
+        fac.Planner(model, planning).close(), {"returns": [0.0]})[2])
     monkeypatch.setattr(fac.Distiller, "ranks", lambda *_: (np.arange(3), np.arange(3)))
     list(experiments.distil("cheetah-run", 0, case, {
         **settings, "steps": 1, "batch_size": 2, "expert_episodes": 0}))
@@ -471,8 +471,7 @@ def test_every_method_of_figure_4_learns_from_its_run_s_seed(replay, monkeypatch
 def test_a_row_holds_the_mean_and_the_least_of_its_returns(monkeypatch):
     rewards, seen = np.array([[1.0, 2.0], [0.0, 9.0], [5.0, 1.0], [0.0, 0.5]]), []
     monkeypatch.setattr(fac, "play", lambda *args: (seen.append(args[3]), (0, 0, rewards, 0))[1])
-    returns = experiments.returns_of(None, "x", None, 4, 101)
-    found = tables.of_returns(returns, 101)
+    found = experiments.measure(None, "x", None, 4, 101)
     assert (found["return_mean"], found["return_min"]) == (4.625, 0.5)  # of 3, 9, 6 and 0.5
     assert found["returns"] == [3, 9, 6, 0.5] and seen == [fac.episode_seeds(101, 4)]
 
@@ -686,7 +685,7 @@ def test_figure_8_s_noise_is_a_standard_normal_cut_at_the_limits(monkeypatch):
 
 def test_a_run_is_planned_disturbed_and_timed_as_it_says(monkeypatch, tmp_path):
     seen, made, planner = [], [], fac.Planner
-    monkeypatch.setattr(experiments, "returns_of", lambda *args: seen.append(args) or [1.0])
+    monkeypatch.setattr(experiments, "measure", lambda *args: seen.append(args) or {})
     fac.save_model(tmp_path / "reacher-hard-0" / "student.npz", random_model(), {"kind": "student"})
     list(experiments.plan_with("reacher-hard", 0, "student", {
         "samples": 7, "iterations": 2, "episodes": 3, "joint": 1, "kind": "noise",
@@ -1179,8 +1178,8 @@ def test_what_is_printed_stands_beside_what_its_search_can_get(tmp_path, monkeyp
     assert (about["preset"], about["reuse"], about["batch_size"], about["expert_episodes"]) == (
         "plain", 1, 64, 1000)
 
-    monkeypatch.setattr(fac, "evaluate", lambda model, task, planning, *_: found.update(
-        planning=planning) or {"returns": [60.0]})
+    monkeypatch.setattr(experiments, "measure", lambda model, task, planning, _, of: found.update(
+        planning=planning) or tables.of_returns([60.0], of))
     rows = [*experiments.printed("walker-run", 0, made[0]["case"], {"episodes": 1}, tmp_path)]
     assert (found["planning"].pi_trajs, found["planning"].samples, found["planning"].prior) == (
         0, 128, "last")
@@ -1643,7 +1642,7 @@ def test_every_way_of_the_authors_program_is_played(tmp_path, monkeypatch):
     monkeypatch.setattr(experiments, "AuthorsPlanner", spy)
     monkeypatch.setattr(experiments, "returns_by", lambda planner, task, episodes, seed: (
         played.append((episodes, seed)) or [len(played), 1.0]))
-    monkeypatch.setattr(fac, "evaluate", lambda model, task, config, episodes, *_: {
+    monkeypatch.setattr(experiments, "measure", lambda model, task, config, episodes, *_: {
         "returns": [0.5] * episodes})
     seen = []
     monkeypatch.setattr(experiments, "run_all", lambda args, function, runs: seen.extend(runs))
