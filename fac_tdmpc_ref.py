@@ -817,7 +817,7 @@ class DistillConfig(Algorithm1Config):
     policy_share: float = field(0.5, "share of states where the policy's actions are perturbed, "
                                 "not those done [D8]", paper=0.0, plain=0.0, least=0, most=1)
     reuse: int = field(4, "steps that learn from a state's perturbations [D1]", paper=1, least=1)
-    expert_episodes: int = field(96, "that its policy plays first [D8]; priors a quarter "
+    expert_episodes: int = field(96, "that its policy plays first [D8]; priors an eighth "
                                  "a round, a sixth to choose [D9]", paper=0, plain=0, least=0)
     played_share: float = field(0.5, "share of states that are from these episodes [D8]",
                                 paper=0.0, plain=0.0, least=0, most=1)
@@ -826,13 +826,12 @@ class DistillConfig(Algorithm1Config):
 
 
 # how a student with priors plans, where no flag says otherwise and no search was chosen
-STUDENT_PLANNING = {"prior": "own", "max_std": 0.15, "samples": 32, "iterations": 3,
+STUDENT_PLANNING = {"prior": "own", "max_std": 0.15, "samples": 16, "iterations": 2,
                     "output": "mean"}
 SEARCH = [f.name for f in dataclasses.fields(PlannerConfig)  # what a student's file says of it
           if f.name not in ("horizon", "discount", "speed", "action_repeat")]
-CHOSEN = "max_std", "samples", "iterations"  # by playing, of these:
-SEARCHES = ({"iterations": 0}, {"samples": 16, "iterations": 2}, {},  # cheapest first: none, two
-            {"max_std": 1.0})                                         # narrow ones, a wide one
+CHOSEN = "max_std", "samples", "iterations"  # by playing, of: none, a narrow search, a wide one
+SEARCHES = {"iterations": 0}, {}, {"max_std": 1.0, "samples": 32, "iterations": 3}
 
 
 def student_planning(config):
@@ -1803,13 +1802,13 @@ def data_file(task, name):
 
 # ==== 12. Commands ====================================================================
 
-def episodes_of(model, task, config, seeds, environment, noise, teacher):
+def episodes_of(model, task, config, seeds, environment, noise, teacher, share):
     """Plan through the episode of each seed; yields its decisions, a list of observation (O,),
     action (A,), reward, seconds of planning and, with a teacher, its plan (N * L * d,). The last
-    three arguments are `play`'s."""
+    four arguments are `play`'s."""
     if environment is None:
         with contextlib.closing(make_robot(task, config.action_repeat)) as environment:
-            yield from episodes_of(model, task, config, seeds, environment, noise, teacher)
+            yield from episodes_of(model, task, config, seeds, environment, noise, teacher, share)
         return
     planners, sizes = [Planner(model, of) for of in (config, teacher) if of], model.config
     T = getattr(environment, "episode_steps", episode_steps(config.action_repeat))
@@ -1819,7 +1818,7 @@ def episodes_of(model, task, config, seeds, environment, noise, teacher):
         obs = checked(environment.reset(seed), (sizes.dim_obs,), "reset: observation")
         rng, decisions = stream(seed, "exploration"), []
         deviation = F32(rng.uniform(0, noise))
-        for t in range(T):
+        for t in range(max(1, int(share * T))):
             begin = time.perf_counter()
             action = planners[0].act(obs)
             seconds = time.perf_counter() - begin
@@ -1849,7 +1848,7 @@ def players(workers, episodes):
 
 
 def play(model, task, config, seeds, workers=None, label="playing", environment=None, noise=0.0,
-         teacher=None):
+         teacher=None, share=1.0):
     """Plan through the episodes of `seeds`: observations (E, T, O), actions (E, T, A), rewards
     (E, T), seconds of planning (E, T); NaN past the end of one shorter than the longest, rewards 0.
 
@@ -1858,13 +1857,13 @@ def play(model, task, config, seeds, workers=None, label="playing", environment=
     environment: instead of the task's, see `robot_step`; with T as `episode_steps` if it has that.
     noise: each episode draws the deviation of what is added to its actions, evenly from 0 to this.
     teacher: a PlannerConfig, by which the model also plans in each state; its plans
-    (E, T, N * L * d) are a fifth array."""
+    (E, T, N * L * d) are a fifth array. share: of an episode that is played, from its beginning."""
     E, episodes, total = len(seeds), [], 0.0
-    here = episodes_of(model, task, config, seeds, environment, noise, teacher)
+    here = episodes_of(model, task, config, seeds, environment, noise, teacher, share)
     with progress(label, E, "episode") as bar, contextlib.ExitStack() as stack:
         workers = workers if environment is None else 0
         pool = workers if isinstance(workers, Workers) else stack.enter_context(players(workers, E))
-        pool.send_all((model, task, config, seeds[w::len(pool)], None, noise, teacher)
+        pool.send_all((model, task, config, seeds[w::len(pool)], None, noise, teacher, share)
                       for w in range(len(pool)))
         for i in range(E):
             episodes.append(pool.receive(i % len(pool)) if len(pool) else next(here))
@@ -1934,19 +1933,20 @@ OWN_NOISE = 0.3  # largest deviation of the noise in episodes that priors play
 def teach_priors(distiller, task, planning, workers=None, environment=None):
     """Each agent learns its own prior [D9], in PRIOR_ROUNDS: what the expert's policy would do, in
     the replay's and the played states and, from the second round on, in states that the priors get
-    into by themselves, a quarter as many episodes a round as the expert's policy played. Then
-    planning is taught back: what the student's search (`planning`) finds around the priors, in as
-    many episodes of theirs. Returns the priors' weights {"policy": ..., "plans": ...}."""
+    into by themselves: in an eighth as many episodes a round as the expert's policy played, and in
+    five times as many beginnings, a tenth as long. Then planning is taught back: what the student's
+    search (`planning`) finds in as many. Returns their weights, {"policy": ..., "plans": ...}."""
     student, config = distiller.student, distiller.config
-    L, episodes = config.horizon + 1, -(-config.expert_episodes // 4)
+    L, episodes = config.horizon + 1, -(-config.expert_episodes // 8)
     reflex = dataclasses.replace(planning, prior="own", iterations=0)
 
     def own_states(number, teacher=None):
-        seeds = training_seeds(distiller.seed, "prior episode", number * episodes, episodes)
-        obs, *_, plans = play(student, task, reflex, seeds, workers, "the priors play", environment,
-                              OWN_NOISE, teacher)
-        lived = np.isfinite(obs).all(2)
-        return obs[lived].T, plans[lived].T
+        seeds = training_seeds(distiller.seed, "prior episode", number * 6 * episodes, 6 * episodes)
+        parts = (seeds[:episodes], 1.0), (seeds[episodes:], 0.1)  # whole ones; beginnings
+        found = [play(student, task, reflex, own, workers, "the priors play", environment,
+                      OWN_NOISE, teacher, share) for own, share in parts]
+        return [np.concatenate([of[k][np.isfinite(of[0]).all(2)].T for of in found], -1)
+                for k in (0, -1)]
 
     def policy_at(obs):
         return in_parts(student.read, obs), in_parts(lambda part: policy_plan(
@@ -2054,7 +2054,7 @@ def train_student(distiller, out, settings, planning, workers):
     began, saved = time.monotonic(), -np.inf
     if not distiller.t and config.expert_episodes:
         distiller.add(*expert_episodes(distiller, settings["task"], planning, workers))
-    every, losses = max(1, min(250, config.steps // 8)), []
+    every, losses = max(1, min(500, config.steps // 8)), []
     with progress("distilling", config.steps, "step", distiller.t) as bar:
         for found in distiller.run():
             losses.append(found)

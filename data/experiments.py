@@ -213,10 +213,13 @@ def command_students(args):
 
 def command_capacity(args):
     """capacity: one model for all joints, taught like a student, beside a model for each."""
+    def sizes(task, case):
+        return ({"num_agents": fac.lookup_task(task)[1]} if case == "default" else
+                {"num_agents": 1, "mlp_dim": students.ONE_MODEL[case](task)})
+
     result = run_all(args, functools.partial(students.distil_student, students=args.students),
-                     distil_runs(args, lambda task: [
-                         (case, {"num_agents": 1, "mlp_dim": students.ONE_MODEL[case](task)})
-                         for case in args.cases]))
+                     distil_runs(args, lambda task: [(case, sizes(task, case))
+                                                     for case in args.cases]))
     students.time_models(Path(result["out"]))
     return result
 
@@ -735,13 +738,12 @@ def report_alone(_, path, figures):
 
 
 def report_capacity(_, path, figures):
-    """One model for all joints beside alone.csv's model for each; the figure: what the narrow
-    searches win against milliseconds, in the episodes of the choice."""
-    own, each = settled(path), settled(path.with_name("alone.csv"))
-    tasks = list(dict.fromkeys(task for task, *_ in own))
-    text, panels = students.capacity_table(students.by_line([
-        row for task in tasks for runs in (each, own) for key, rows in runs.items()
-        if key[0] == task for row in rows]))
+    """One model for all joints beside a model for each; the figure: what the narrow searches win
+    against milliseconds, in the episodes of the choice."""
+    rows = sorted(settled_rows(path), key=lambda row: row["case"] != "default")
+    tasks = list(dict.fromkeys(row["task"] for row in rows))
+    text, panels = students.capacity_table(students.by_line(
+        [row for task in tasks for row in rows if row["task"] == task]))
     draw_lines(figures / "capacity.png", panels, "milliseconds of a decision",
                "return - the priors' alone")
     return {"tasks": tasks}, text
@@ -869,13 +871,13 @@ def make_parser():
     for name in ("steps", "samples", "iterations"):
         sub.add_argument(f"--{name}", type=positive, help="distill's [the preset's]")
     sub = add_runs("capacity", command_capacity, "Is it the factoring? One model for all joints, "
-                   "taught like a student (report: beside these, alone.csv): returns, then "
+                   "taught like a student, beside a model for each (default): returns, then "
                    "milliseconds (keep the machine quiet for these).", [
                        "walker-run", "quadruped-walk", "quadruped-run", "humanoid-stand",
                        "humanoid-walk"], episodes=5)
-    sub.add_argument("--cases", nargs="+", default=[*students.ONE_MODEL], metavar="CASE",
-                     choices=[*students.ONE_MODEL],
-                     help=f"any of: {'; '.join(students.ONE_MODEL)} [all]")
+    cases = ["default", *students.ONE_MODEL]
+    sub.add_argument("--cases", nargs="+", default=cases, metavar="CASE", choices=cases,
+                     help=f"any of: {'; '.join(cases)} [all]")
     sub = add_runs("experts", command_experts, "Is it the expert? Students of several experts of "
                    "a task, of EXPERTS/TASK-SEED-STAGE/ (expert.npz, replay.npz).",
                    ["finger-spin"], episodes=5)

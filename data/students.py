@@ -242,8 +242,8 @@ def time_models(path):
     with lock(path):
         rows, found = read_rows(path), {}
         for row in rows:
-            if row["ranks"] and "ms_by_search" not in (about := json.loads(row["ranks"])):
-                width = json.loads(row["settings"])["mlp_dim"]
+            width = json.loads(row["settings"]).get("mlp_dim")  # a model for each: beside these
+            if width and row["ranks"] and "ms_by_search" not in (about := json.loads(row["ranks"])):
                 if (key := (row["task"], width)) not in found:
                     found[key] = time_searches(*key)
                 row["ranks"] = json.dumps({**about, "ms_by_search": found[key]})
@@ -251,28 +251,24 @@ def time_models(path):
 
 
 def time_searches(task, width):
-    """Milliseconds (2, 4): of a model for each joint and of one model, this wide, by `searches`."""
-    calls = []
+    """Milliseconds of a model for each joint, and of one model, this wide, by `fac.SEARCHES`."""
+    calls, searches = [], [fac.PlannerConfig(**{**fac.STUDENT_PLANNING, **search})
+                           for search in fac.SEARCHES]
     for sizes in sizes_of(task), sizes_of(task, 1, width):
         model = fac.WorldModel.create(sizes, np.random.default_rng(0))
         obs = np.zeros(sizes.dim_obs, fac.F32)
         calls += [functools.partial(fac.Planner(model, planning).act, obs)
-                  for planning in searches()]
+                  for planning in searches]
     seconds = fac.interleaved_seconds(calls, 20, f"{task}, timing")
     return (1e3 * np.median(seconds, 0)).reshape(2, -1).tolist()
 
 
-def searches():
-    """The PlannerConfigs that a student chooses from."""
-    return [fac.PlannerConfig(**{**fac.STUDENT_PLANNING, **search}) for search in fac.SEARCHES]
-
-
 def played_by_search(row):
-    """Returns (4, episodes), of the priors that a student kept and of each search around them, in
-    the episodes by which it chose."""
+    """{search: returns (episodes,)}, cheapest first, of the priors that a student kept and of each
+    search around them, in the episodes by which it chose."""
     played = json.loads(row["ranks"])["played"]
-    taught = played[-1]["taught"]
-    return np.array([of["returns"] for of in played if of["taught"] == taught])
+    return {"{samples} x {iterations}, {max_std}".format_map(of) if of["iterations"] else "priors":
+            of["returns"] for of in played if of["taught"] == played[-1]["taught"]}
 
 
 def capacity_table(lines):
@@ -288,9 +284,10 @@ def capacity_table(lines):
         rows, first = sum(by_seed.values(), []), by_seed[min(by_seed)]
         task, case, settings = first[0]["task"], first[0]["case"], json.loads(first[0]["settings"])
         _, error = difference(by_seed, over="expert_returns")
-        ms = timed[task, case][:3]
+        ms = timed[task, case][:3]  # a fourth takes as long as the third
         sizes = sizes_of(task, settings["num_agents"], settings.get("mlp_dim"))
-        played = np.stack([*map(played_by_search, first)], 1)  # (4, students, episodes)
+        by_search = [*map(played_by_search, first)]  # of each student
+        played = np.stack([[*of.values()] for of in by_search], 1)  # (searches, students, episodes)
         expert, student = (overall(rows, key) for key in ("expert_returns", "returns"))
         name = f"{sizes.num_agents} models" if case == "default" else case
         found.append([
@@ -302,8 +299,7 @@ def capacity_table(lines):
         label = "a model for each joint" if case == "default" else case
         panels.setdefault(task, ({}, None))[0][label] = {
             x: (of - played[0]).mean(1).tolist() for x, of in zip(ms, played)}
-    searched = ["{samples} x {iterations}, {max_std} - priors".format_map(vars(of))
-                for of in searches()[1:]]
+    searched = [f"{name} - priors" for name in [*by_search[0]][1:]]
     return markdown(["task", "models", "width", "weights", "students", "expert", "student",
                      "priors", *searched, "rank of G, H = 0 / last", "ms: priors / 16 x 2 / 32 x 3",
                      "minutes, least"], found), panels

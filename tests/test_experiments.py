@@ -1121,9 +1121,9 @@ def test_one_model_is_distilled_like_a_student(monkeypatch):
     monkeypatch.setattr(students, "time_models", lambda path: None)
     assert experiments.main(["capacity", "--tasks", "walker-run", "--seeds", "4"]) == 0
     about = [json.loads(run["settings"]) for run in made]
-    assert [(run["case"], of["num_agents"], of["mlp_dim"]) for run, of in zip(made, about)] == [
-        ("one model, equal weights", 1, 241), ("one model, 512 wide", 1, 512)]
-    assert str(students.folder("runs", "walker-run", 4, made[0]["case"])) == (
+    assert [(run["case"], of["num_agents"], of.get("mlp_dim")) for run, of in zip(made, about)] == [
+        ("default", 6, None), ("one model, equal weights", 1, 241), ("one model, 512 wide", 1, 512)]
+    assert str(students.folder("runs", "walker-run", 4, made[1]["case"])) == (
         "runs/walker-run-4-one-model-equal-weights")
 
 
@@ -1207,8 +1207,8 @@ def test_capacity_is_timed_once_and_told_in_a_table(tmp_path, monkeypatch):
     """Two students of a model for each joint, one of one model; a search wins over the priors that
     it searches around, not over those that the policy taught."""
     def rows(kept, narrow):
-        played = [{"taught": taught, "iterations": iterations, "max_std": std, "returns": found}
-                  for taught, iterations, std, found in (
+        played = [{"taught": taught, "samples": 16, "iterations": iterations, "max_std": std,
+                   "returns": found} for taught, iterations, std, found in (
                       ("policy", 0, 1.0, [0.0, 0.0]), ("plans", 0, 1.0, kept),
                       ("plans", 2, 0.15, kept), ("plans", 3, 0.15, narrow),
                       ("plans", 3, 1.0, kept))]
@@ -1217,13 +1217,11 @@ def test_capacity_is_timed_once_and_told_in_a_table(tmp_path, monkeypatch):
                      "played": played, "rank_correlation_returns": [0.9, 0.7, 0.5]}}
                 for seed in (102, 101)]
 
-    write_rows(tmp_path / "alone.csv", [
-        ("walker-run", 0, "default", {"num_agents": 6}, rows([10.0, 30.0], [30.0, 70.0])),
-        ("walker-run", 1, "default", {"num_agents": 6}, rows([20.0, 20.0], [40.0, 80.0])),
-        ("cheetah-run", 1, "default", {"num_agents": 6}, rows([20.0, 20.0], [40.0, 80.0]))])
     write_rows(path := tmp_path / "capacity.csv", [
         ("walker-run", 0, "one model, equal weights", {"num_agents": 1, "mlp_dim": 241},
-         rows([50.0, 50.0], [49.0, 49.0]))])
+         rows([50.0, 50.0], [49.0, 49.0])),
+        ("walker-run", 0, "default", {"num_agents": 6}, rows([10.0, 30.0], [30.0, 70.0])),
+        ("walker-run", 1, "default", {"num_agents": 6}, rows([20.0, 20.0], [40.0, 80.0]))])
     timed = []
 
     def seconds(calls, *_):
@@ -1233,7 +1231,7 @@ def test_capacity_is_timed_once_and_told_in_a_table(tmp_path, monkeypatch):
     monkeypatch.setattr(fac, "interleaved_seconds", seconds)
     for _ in range(2):
         students.time_models(path)
-    assert [len(calls) for calls in timed] == [8]  # two models, four searches
+    assert [len(calls) for calls in timed] == [6]  # two models, three searches
     result, text = experiments.report_capacity("capacity", path, tmp_path)
     each, one = ([cell.strip() for cell in line.split("|")[1:-1]] for line in
                  text.splitlines()[2:])
@@ -1243,7 +1241,7 @@ def test_capacity_is_timed_once_and_told_in_a_table(tmp_path, monkeypatch):
                     "+0 ± 0", "+35 ± 16", "+0 ± 0", "0.90 / 0.50", "1.00 / 2.00 / 3.00", "6.0"]
     assert one[1:4] == ["one model, equal weights", "241", "375k"]
     assert one[7:11] == ["50", "+0 ± 0", "-1 ± 0", "+0 ± 0"]
-    assert one[12] == "5.00 / 6.00 / 7.00"
+    assert one[12] == "4.00 / 5.00 / 6.00" and "| 16 x 3, 0.15 - priors |" in text
     assert result == {"tasks": ["walker-run"]} and (tmp_path / "capacity.png").exists()
 
 

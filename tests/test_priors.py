@@ -178,7 +178,7 @@ def test_priors_learn_from_the_states_that_they_get_into_themselves(replay, monk
 
     def watched(model, task, planning, seeds, *arguments):
         found = play(model, task, planning, seeds, *arguments)
-        played.append((planning, seeds, arguments[-2:], found))
+        played.append((planning, seeds, arguments[-3:], found))
         return found
 
     monkeypatch.setattr(fac, "play", watched)
@@ -189,21 +189,26 @@ def test_priors_learn_from_the_states_that_they_get_into_themselves(replay, monk
         fac.teach_priors(distiller, None, planning, environment=Toy())
         student, expert = distiller.student, distiller.expert
     assert [(number, len(data)) for number, data in rounds] == [(0, 1), (1, 2), (2, 3), (3, 1)]
-    seeds = fac.training_seeds(0, "prior episode", 0, 6)  # two a round: a quarter of five
-    assert [own for _, own, _, _ in played] == [seeds[2:4], seeds[4:], seeds[:2]]
-    for reflex, _, (noise, _), _ in played:
+    seeds = fac.training_seeds(0, "prior episode", 0, 18)  # a round: an eighth of five, five short
+    assert [own for _, own, _, _ in played] == [
+        of for i in (6, 12, 0) for of in (seeds[i:i + 1], seeds[i + 1:i + 6])]
+    for reflex, _, (noise, *_), _ in played:
         assert (reflex.prior, reflex.iterations, noise) == ("own", 0, fac.OWN_NOISE)
-    assert [teacher for *_, (_, teacher), _ in played] == [None, None, planning]
+    assert [about[1:] for *_, about, _ in played] == [
+        (teacher, share) for teacher in (None, None, planning) for share in (1.0, 0.1)]
+    assert [found[0].shape for *_, found in played] == [(1, 12, 8), (5, 1, 8)] * 3
+    rows = [[np.concatenate([x.reshape(-1, x.shape[-1]) for x in arrays]).T for arrays in zip(
+        *((found[0], found[-1].reshape(*found[0].shape[:2], -1)) for *_, found in played[i:i + 2]))]
+            for i in (0, 2, 4)]
     whole = len(distiller.train_starts) + len(distiller.played)
     assert rounds[0][1][0][0].shape[-1] == whole
-    for (x, plans), (obs, *_) in zip(rounds[2][1][1:], (found for *_, found in played)):
-        obs = obs.reshape(-1, 8).T
+    for (x, plans), (obs, _) in zip(rounds[2][1][1:], rows):
         np.testing.assert_allclose(x, student.read(obs), atol=1e-5)
         np.testing.assert_allclose(plans, fac.policy_plan(expert, obs, 4, student.config),
                                    atol=1e-4)
-    ((x, plans),), (obs, *_, searched) = rounds[3][1], played[2][3]
-    np.testing.assert_allclose(x, student.read(obs.reshape(-1, 8).T), atol=1e-5)
-    assert np.array_equal(plans.reshape(12, -1), searched.reshape(-1, 12).T)
+    ((x, plans),), (obs, searched) = rounds[3][1], rows[2]
+    np.testing.assert_allclose(x, student.read(obs), atol=1e-5)
+    assert np.array_equal(plans.reshape(12, -1), searched)
 
 
 def test_where_nobody_plays_priors_learn_from_the_replay_alone(replay, monkeypatch):
@@ -311,7 +316,7 @@ def test_progress_tells_returns_also_where_a_teacher_plans(capsys):
 # choosing -----------------------------------------------------------------------------
 
 NONE, SMALL, LARGE = (fac.PlannerConfig(**{**fac.STUDENT_PLANNING, **search}) for search in (
-    {"iterations": 0}, {"samples": 16, "iterations": 2}, {}))
+    {"iterations": 0}, {}, {"samples": 32, "iterations": 3}))
 STILL = {"taught": "policy", "max_std": 0.15, "samples": 32, "iterations": 0}
 
 
