@@ -185,7 +185,7 @@ def linear_backward(dy, x, W):
 
 def elu(x):
     """y = x where x > 0, else exp(x) - 1: the larger of x and exp(min(x, 0)) - 1."""
-    y = np.clip(x, -np.inf, 0)  # 3 times as fast as minimum
+    y = x.clip(-np.inf, 0)  # 3 times as fast as minimum
     np.exp(y, out=y)  # expm1 takes 4 times as long where there is no AVX-512
     y -= 1
     return np.maximum(x, y, out=y)
@@ -193,7 +193,7 @@ def elu(x):
 
 def elu_backward(dy, y):
     """y = elu(x): dy/dx is 1 where y > 0, else exp(x) = y + 1. Overwrites dy with dx."""
-    dy *= np.clip(y, -np.inf, 0) + 1
+    dy *= y.clip(-np.inf, 0) + 1
     return dy
 
 
@@ -826,7 +826,7 @@ class DistillConfig(Algorithm1Config):
 
 
 # how a student with priors plans, where no flag says otherwise and no search was chosen
-STUDENT_PLANNING = {"prior": "own", "max_std": 0.15, "samples": 16, "iterations": 2,
+STUDENT_PLANNING = {"prior": "own", "max_std": 0.15, "samples": 16, "iterations": 1,
                     "output": "mean"}
 SEARCH = [f.name for f in dataclasses.fields(PlannerConfig)  # what a student's file says of it
           if f.name not in ("horizon", "discount", "speed", "action_repeat")]

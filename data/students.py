@@ -299,9 +299,11 @@ def capacity_table(lines):
         label = "a model for each joint" if case == "default" else case
         panels.setdefault(task, ({}, None))[0][label] = {
             x: (of - played[0]).mean(1).tolist() for x, of in zip(ms, played)}
-    searched = [f"{name} - priors" for name in [*by_search[0]][1:]]
+    names = [*by_search[0]]
+    searched = [f"{name} - priors" for name in names[1:]]
+    timed = " / ".join(name.split(",")[0] for name in names[:3])
     return markdown(["task", "models", "width", "weights", "students", "expert", "student",
-                     "priors", *searched, "rank of G, H = 0 / last", "ms: priors / 16 x 2 / 32 x 3",
+                     "priors", *searched, "rank of G, H = 0 / last", f"ms: {timed}",
                      "minutes, least"], found), panels
 
 

@@ -316,7 +316,7 @@ def test_progress_tells_returns_also_where_a_teacher_plans(capsys):
 # choosing -----------------------------------------------------------------------------
 
 NONE, SMALL, LARGE = (fac.PlannerConfig(**{**fac.STUDENT_PLANNING, **search}) for search in (
-    {"iterations": 0}, {}, {"samples": 32, "iterations": 3}))
+    {"iterations": 0}, {"iterations": 2}, {"samples": 32, "iterations": 3}))
 STILL = {"taught": "policy", "max_std": 0.15, "samples": 32, "iterations": 0}
 
 
