@@ -448,7 +448,7 @@ def test_a_departure_s_student_searches_around_its_priors_but_for_d9(monkeypatch
     list(experiments.distil("cheetah-run", 0, case, {
         **settings, "steps": 1, "batch_size": 2, "expert_episodes": 0}))
     reflex = [(6, "own", 0)] * (prior == "own")
-    assert planned == [(6, prior, 3 if prior == "own" else 4), (1, "own", 0), *reflex] * 2
+    assert planned == [(6, prior, 1 if prior == "own" else 4), (1, "own", 0), *reflex] * 2
 
 
 def test_every_method_of_figure_4_learns_from_its_run_s_seed(replay, monkeypatch):
@@ -1272,7 +1272,7 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
     assert [json.loads(row["settings"]).get("samples") for row in rows] == [None, None, 4, 4]
     assert len(experiments.finished(rows)) == 2
     _, header = fac.load_model(tmp_path / "reacher-easy-3" / "student.npz")
-    assert header["planner"]["samples"] == 32
+    assert header["planner"]["samples"] == 16
     model, header = fac.load_model(tmp_path / "reacher-easy-3-samples-4-iterations-1" /
                                    "student.npz")
     assert (header["seed"], model.config.num_agents, header["distill"]["steps"]) == (3, 3, 1)
