@@ -1294,7 +1294,7 @@ def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkey
         assert row["versions"] == experiments.versions()
         assert f"numpy {np.__version__}" in row["versions"] and "mujoco 3" in row["versions"]
     result = json.loads((tmp_path / "reacher-easy-3" / "result.json").read_text())
-    assert (result["eval_seed"], result["samples"]) == (101, 32)
+    assert (result["eval_seed"], result["samples"]) == (101, 16)
     _, text = experiments.report_alone("alone", path, tmp_path)
     lines = [line.split("|")[1].strip() for line in text.split("\n\n")[1].splitlines()[2:]]
     assert lines == ["reacher-easy", "reacher-easy, samples 4, iterations 1"]
