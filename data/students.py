@@ -274,7 +274,7 @@ def played_by_search(row):
 def capacity_table(lines):
     """One model for all joints beside a model for each, taught alike: what searching wins over the
     priors is of the episodes by which a student chose. lines: `by_line`'s, of every task some that
-    `time_models` timed. Markdown, and panels of what the two narrow searches win against
+    `time_models` timed. Markdown, and panels of what the first two searches win against
     milliseconds."""
     timed, found, panels = {}, [], {}
     for row in (by_seed[min(by_seed)][0] for by_seed in lines.values()):
@@ -299,11 +299,11 @@ def capacity_table(lines):
         label = "a model for each joint" if case == "default" else case
         panels.setdefault(task, ({}, None))[0][label] = {
             x: (of - played[0]).mean(1).tolist() for x, of in zip(ms, played)}
-    names = [*by_search[0]]
+    names = [*by_search[0]]  # all lines' alike
     searched = [f"{name} - priors" for name in names[1:]]
-    timed = " / ".join(name.split(",")[0] for name in names[:3])
+    budgets = " / ".join(name.split(",")[0] for name in names[:3])
     return markdown(["task", "models", "width", "weights", "students", "expert", "student",
-                     "priors", *searched, "rank of G, H = 0 / last", f"ms: {timed}",
+                     "priors", *searched, "rank of G, H = 0 / last", f"ms: {budgets}",
                      "minutes, least"], found), panels
 
 
