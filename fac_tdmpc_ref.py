@@ -2008,8 +2008,8 @@ def choose_by_playing(distiller, task, taught, plannings, workers=None, environm
     """Which priors of `teach_priors` a student keeps, and which of the plannings, cheapest first,
     it searches around them by: all play the same episodes, a sixth as many as the expert's policy
     played; first the priors alone, then each search around the better ones. The best mean is kept,
-    or what is cheaper and, by the differences of episodes, within a standard error or a hundredth
-    of it. Returns the planning and what was played, a list of dicts."""
+    or what is cheaper and within a hundredth of it. Returns the planning and what was played, a
+    list of dicts."""
     played, student = [], distiller.student
     seeds = training_seeds(distiller.seed, "choice", 0, -(-distiller.config.expert_episodes // 6))
 
@@ -2026,12 +2026,10 @@ def choose_by_playing(distiller, task, taught, plannings, workers=None, environm
     student.params.update(taught[best])
     if not seeds or len(plannings) == 1:
         return plannings[-1], played
-    found = [alone[best] if planning.iterations == 0 else returns(best, planning)
+    means = [(alone[best] if planning.iterations == 0 else returns(best, planning)).mean()
              for planning in plannings]
-    behind = (highest := max(found, key=np.mean)) - np.array(found)
-    error = behind.std(1) / max(1, len(seeds) - 1) ** 0.5
-    within = behind.mean(1) <= np.maximum(error, abs(highest.mean()) / 100)
-    return plannings[int(np.argmax(within))], played
+    least = max(means) - abs(max(means)) / 100
+    return plannings[[mean >= least for mean in means].index(True)], played
 
 
 CURVE = ("step", "seconds", "loss", "kl_reward", "kl_value", "lr", "rank_correlation_h0",
