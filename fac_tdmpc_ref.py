@@ -1071,6 +1071,12 @@ class Distiller:
         np.add(*(gradient for gradient, _ in halves), out=optimizer.gradient)
         return losses
 
+    def in_parts(self, function, obs):
+        """What a function makes of many observations (O, M), by the threads: (..., M)."""
+        parts = np.array_split(obs, -(-obs.shape[1] // 512), 1)
+        with one_thread():
+            return np.concatenate([*self._threads.map(function, parts)], -1)
+
     def run(self):
         """Algorithm 1 from here to its end; yields each step's losses. UserError if they diverge.
         `add` what the expert's policy plays first."""
@@ -1949,8 +1955,8 @@ def teach_priors(distiller, task, planning, workers=None, environment=None):
                 for k in (0, -1)]
 
     def policy_at(obs):
-        return in_parts(student.read, obs), in_parts(lambda part: policy_plan(
-            distiller.expert, part, L, student.config), obs)
+        return distiller.in_parts(student.read, obs), distiller.in_parts(
+            lambda part: policy_plan(distiller.expert, part, L, student.config), obs)
 
     known = distiller.replay.sequences(distiller.train_starts, 1)[0]
     played = distiller.played[:, :distiller.replay.dim_obs].T.astype(F32)
@@ -1963,7 +1969,7 @@ def teach_priors(distiller, task, planning, workers=None, environment=None):
     if episodes and planning.iterations:
         obs, plans = own_states(0, planning)
         plans = plans.reshape(student.config.num_agents, L, -1, obs.shape[1])
-        learn_priors(distiller, [(in_parts(student.read, obs), plans)], PRIOR_ROUNDS)
+        learn_priors(distiller, [(distiller.in_parts(student.read, obs), plans)], PRIOR_ROUNDS)
         taught["plans"] = prior_weights(student)
     return taught
 
@@ -1971,13 +1977,6 @@ def teach_priors(distiller, task, planning, workers=None, environment=None):
 def prior_weights(student):
     """A copy of a student's priors' weights."""
     return {k: v.copy() for k, v in student.params.items() if k.startswith("_prior")}
-
-
-def in_parts(function, obs):
-    """What a function makes of many observations (O, M): (..., M)."""
-    with one_thread():
-        return np.concatenate([function(part) for part in np.array_split(
-            obs, -(-obs.shape[1] // 512), 1)], -1)
 
 
 def learn_priors(distiller, data, number):
