@@ -205,20 +205,15 @@ def command_students(args):
     config = fac.DistillConfig(**fac.preset_values(fac.DistillConfig, args.preset))
     args.steps = args.steps or config.steps
     result = run_all(args, functools.partial(students.distil_student, students=args.students),
-                     distil_runs(args, lambda task: [
-                         (args.preset, {"num_agents": fac.lookup_task(task)[1]})]))
+                     distil_runs(args, lambda task: [(args.preset, students.each(task))]))
     time_students(Path(result["out"]), args.tasks)
     return result
 
 
 def command_capacity(args):
     """capacity: one model for all joints, taught like a student, beside a model for each."""
-    def sizes(task, case):
-        return ({"num_agents": fac.lookup_task(task)[1]} if case == "default" else
-                {"num_agents": 1, "mlp_dim": students.ONE_MODEL[case](task)})
-
     result = run_all(args, functools.partial(students.distil_student, students=args.students),
-                     distil_runs(args, lambda task: [(case, sizes(task, case))
+                     distil_runs(args, lambda task: [(case, students.MODELS[case](task))
                                                      for case in args.cases]))
     students.time_models(Path(result["out"]))
     return result
@@ -234,8 +229,8 @@ def command_experts(args):
         about = {"preset": "default", "expert": str(path), "episodes": args.episodes,
                  "weights": fac.checksum(expert.params.values())}
         runs += [make_run(task, seed, f"{stage}: {case}", **about, **sizes) for case, sizes in (
-            ("a model for each joint", {"num_agents": fac.lookup_task(task)[1]}),
-            ("one model", {"num_agents": 1, "mlp_dim": students.equal_width(task, path)}))]
+            ("a model for each joint", students.each(task)),
+            ("one model", students.one(task, path)))]
     return run_all(args, functools.partial(students.distil_student, students=args.students), runs)
 
 
@@ -260,7 +255,7 @@ def printed(task, seed, case, settings, folder):
 def command_printed(args):
     """printed: what the method lacks as it is printed: data, states, or a policy."""
     def cases(task):
-        models = {"": {}, ", one model": {"num_agents": 1, "mlp_dim": students.equal_width(task)}}
+        models = {"": {}, ", one model": students.one(task)}
         for batch, data, (name, sizes) in itertools.product(args.batches, args.data,
                                                             models.items()):
             yield f"{data}, {args.steps} x {batch}{name}", {
@@ -875,7 +870,7 @@ def make_parser():
                    "milliseconds (keep the machine quiet for these).", [
                        "walker-run", "quadruped-walk", "quadruped-run", "humanoid-stand",
                        "humanoid-walk"], episodes=5)
-    cases = ["default", *students.ONE_MODEL]
+    cases = [*students.MODELS]
     sub.add_argument("--cases", nargs="+", default=cases, metavar="CASE", choices=cases,
                      help=f"any of: {'; '.join(cases)} [all]")
     sub = add_runs("experts", command_experts, "Is it the expert? Students of several experts of "

@@ -42,14 +42,19 @@ def weights(sizes):
                if not name.endswith("_encoder"))
 
 
-def equal_width(task, path=None):
-    """The hidden width with which one model for all joints has as many weights as a model for each
-    have together."""
-    return of_equal_weights(sizes_of(task, 1, path=path), sizes_of(task, path=path),
-                            weights).mlp_dim
+def each(task):
+    """`distill`'s sizes of a model for each joint."""
+    return {"num_agents": fac.lookup_task(task)[1]}
 
 
-ONE_MODEL = {"one model, equal weights": equal_width, "one model, 512 wide": lambda task: 512}
+def one(task, path=None):
+    """`distill`'s sizes of one model for all joints, of as many weights as a model for each."""
+    sizes = of_equal_weights(sizes_of(task, 1, path=path), sizes_of(task, path=path), weights)
+    return {"num_agents": 1, "mlp_dim": sizes.mlp_dim}
+
+
+MODELS = {"default": each, "one model, equal weights": one,
+          "one model, 512 wide": lambda task: {"num_agents": 1, "mlp_dim": 512}}
 
 
 def compared(expert, student):
@@ -101,9 +106,9 @@ def argue(args, chosen):
 
 def distil_student(task, seed, case, settings, students):
     """Distil a student by `distill`, which leaves it in `students`, once; a row for each evaluation
-    seed. case: a preset, one of ONE_MODEL or, where settings name a preset, any; settings: of
+    seed. case: a preset, one of MODELS or, where settings name a preset, any; settings: of
     distill's flags or FLAGS, and, for a run to be known by, an own expert's `weights`."""
-    preset = settings.pop("preset", "default" if case in ONE_MODEL else case)
+    preset = settings.pop("preset", "default" if case in MODELS else case)
     settings.pop("weights", None)
     flags = [f"--{FLAGS.get(name, name).replace('_', '-')}={value}"
              for name, value in settings.items()]
@@ -284,7 +289,7 @@ def capacity_table(lines):
         rows, first = sum(by_seed.values(), []), by_seed[min(by_seed)]
         task, case, settings = first[0]["task"], first[0]["case"], json.loads(first[0]["settings"])
         _, error = difference(by_seed, over="expert_returns")
-        ms = timed[task, case][:3]  # a fourth takes as long as the third
+        ms = timed.get((task, case), ())[:3]  # a fourth takes as long as the third
         sizes = sizes_of(task, settings["num_agents"], settings.get("mlp_dim"))
         by_search = [*map(played_by_search, first)]  # of each student
         played = np.stack([[*of.values()] for of in by_search], 1)  # (searches, students, episodes)
@@ -294,7 +299,7 @@ def capacity_table(lines):
             task, name, sizes.mlp_dim, f"{weights(sizes) / 1e3:.0f}k", len(first), f"{expert:.0f}",
             f"{student:.0f} ± {error:.0f}", f"{played[0].mean():.0f}",
             *("{:+.0f} ± {:.0f}".format(*mean_and_error(of - played[0])) for of in played[1:]),
-            ranks(first), " / ".join(f"{x:.2f}" for x in ms),
+            ranks(first), " / ".join(f"{x:.2f}" for x in ms) or "-",
             f"{min(float(row['minutes']) for row in first):.1f}"])
         label = "a model for each joint" if case == "default" else case
         panels.setdefault(task, ({}, None))[0][label] = {

@@ -1104,7 +1104,7 @@ def test_what_each_joint_wins_alone_is_told_in_two_tables(tmp_path):
 
 def test_one_model_for_all_joints_has_as_many_weights_as_a_model_for_each():
     for task, width in (("walker-run", 241), ("humanoid-walk", 300)):
-        assert students.equal_width(task) == width
+        assert students.one(task)["mlp_dim"] == width
         each, one = students.sizes_of(task), students.sizes_of(task, 1, width)
         assert abs(students.weights(one) / students.weights(each) - 1) < 0.005
         assert each.num_agents == each.dim_action and one.num_agents == 1
@@ -1243,6 +1243,10 @@ def test_capacity_is_timed_once_and_told_in_a_table(tmp_path, monkeypatch):
     assert one[7:11] == ["50", "+0 ± 0", "-1 ± 0", "+0 ± 0"]
     assert one[12] == "4.00 / 5.00 / 6.00" and "| 16 x 3, 0.15 - priors |" in text
     assert result == {"tasks": ["walker-run"]} and (tmp_path / "capacity.png").exists()
+    write_rows(path := tmp_path / "each.csv", [
+        ("walker-run", 0, "default", {"num_agents": 6}, rows([10.0, 30.0], [30.0, 70.0]))])
+    students.time_models(path)  # nothing to be beside
+    assert "| 0.90 / 0.50 | - | 6.0 |" in experiments.report_capacity("capacity", path, tmp_path)[1]
 
 
 def test_students_are_distilled_once_and_evaluated_on_two_seeds(tmp_path, monkeypatch):
