@@ -1,4 +1,5 @@
 """This project's figures: one style, written whole, and no run lost where one can't be drawn."""
+import contextlib
 import io
 import os
 import sys
@@ -28,6 +29,25 @@ def pyplot_for(path):
              f"{path}: expected the name of a .png file")
     fac.check_writable(path)
     return pyplot()
+
+
+@contextlib.contextmanager
+def panels(path, count, most, width, height, **options):
+    """So many axes, at most `most` in a row, of this size; in the end one legend for all, and the
+    picture is written."""
+    columns = min(most, count)
+    rows = -(-count // columns)
+    figure, grid = pyplot().subplots(rows, columns, squeeze=False, layout="constrained",
+                                     figsize=(width * columns, height * rows), **options)
+    axes = grid.flat[:count]
+    for ax in grid.flat[count:]:
+        ax.remove()
+    yield axes
+    handles = {label: handle for ax in axes
+               for handle, label in zip(*ax.get_legend_handles_labels())}
+    figure.legend(handles.values(), handles, loc="outside lower center", fontsize=8,
+                  ncols=2 * columns)
+    drawn(save_figure, path, figure)
 
 
 def save_figure(path, figure):

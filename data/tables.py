@@ -4,7 +4,6 @@ Here ± is the sample deviation over seeds (n - 1); students.py's is a standard 
 of means, never a mean of ratios.
 """
 import csv
-import itertools
 from pathlib import Path
 
 import numpy as np
@@ -63,62 +62,43 @@ def cell(found):
 def draw_lines(path, panels, xlabel, ylabel="episode return", **axes):
     """A panel each {title: ({label: {x: [values]}}, level or None)}: mean and band (± sample
     deviation) over seeds; the level, an expert's, is a line across."""
-    plt = plots.pyplot()
     labels = list(dict.fromkeys(label for lines, _ in panels.values() for label in lines))
-    cycle, columns = list(plt.rcParams["axes.prop_cycle"]), min(4, len(panels))
-    handles = {}
-    figure, grid = plt.subplots(-(-len(panels) // columns), columns, squeeze=False,
-                                figsize=(3.6 * columns, 3.8 * -(-len(panels) // columns)),
-                                layout="constrained")
-    for ax, (title, (lines, level)) in itertools.zip_longest(grid.flat, panels.items(),
-                                                             fillvalue=(None, (None, None))):
-        if lines is None:
-            ax.remove()
-            continue
-        for label, points in lines.items():
-            style = cycle[labels.index(label) % len(cycle)]  # the same in all panels
-            x = sorted(points)
-            mean, std = (np.array([f(points[v]) for v in x]) for f in (np.mean, deviation))
-            ax.plot(x, mean, marker=".", label=label, **style)
-            ax.fill_between(x, mean - std, mean + std, color=style["color"], alpha=0.15)
-        if level is not None:
-            ax.axhline(level, color="black", linewidth=0.8, linestyle=(0, (1, 3)), label="expert")
-        low = min([0, *(np.mean(y) for points in lines.values() for y in points.values())])
-        ax.set(title=title, xlabel=xlabel, ylabel=ylabel,
-               ylim=(1.05 * low, 1.05 * max(0, ax.get_ylim()[1])), **axes)
-        if axes:  # logarithmic: a tick for each point
-            ax.set_xticks(x := sorted(set().union(*lines.values())), [f"{v:.0f}" for v in x])
-            ax.minorticks_off()
-        else:
-            ax.locator_params("x", nbins=5)
-        handles.update((label, handle) for handle, label in zip(*ax.get_legend_handles_labels()))
-    figure.legend(handles.values(), handles, loc="outside lower center", fontsize=8,
-                  ncols=2 * columns)
-    plots.drawn(plots.save_figure, path, figure)
+    cycle = list(plots.pyplot().rcParams["axes.prop_cycle"])
+    with plots.panels(path, len(panels), 4, 3.6, 3.8) as grid:
+        for ax, (title, (lines, level)) in zip(grid, panels.items()):
+            for label, points in lines.items():
+                style = cycle[labels.index(label) % len(cycle)]  # the same in all panels
+                x = sorted(points)
+                mean, std = (np.array([f(points[v]) for v in x]) for f in (np.mean, deviation))
+                ax.plot(x, mean, marker=".", label=label, **style)
+                ax.fill_between(x, mean - std, mean + std, color=style["color"], alpha=0.15)
+            if level is not None:
+                ax.axhline(level, color="black", linewidth=0.8, linestyle=(0, (1, 3)),
+                           label="expert")
+            low = min([0, *(np.mean(y) for points in lines.values() for y in points.values())])
+            ax.set(title=title, xlabel=xlabel, ylabel=ylabel,
+                   ylim=(1.05 * low, 1.05 * max(0, ax.get_ylim()[1])), **axes)
+            if axes:  # logarithmic: a tick for each point
+                ax.set_xticks(x := sorted(set().union(*lines.values())), [f"{v:.0f}" for v in x])
+                ax.minorticks_off()
+            else:
+                ax.locator_params("x", nbins=5)
 
 
 def draw_dots(path, panels, xlabel):
     """A panel each {title: {case: {label: (mean, error)}}}: a line for a case, a dot a label."""
-    plt, handles = plots.pyplot(), {}
-    columns, height = min(3, len(panels)), 1.5 + 0.28 * max(map(len, panels.values()))
-    figure, grid = plt.subplots(-(-len(panels) // columns), columns, squeeze=False,
-                                figsize=(1 + 4.5 * columns, height * -(-len(panels) // columns)),
-                                layout="constrained")
-    for ax in grid.flat[len(panels):]:
-        ax.remove()
-    for ax, (title, cases) in zip(grid.flat, panels.items()):
-        labels = list(dict.fromkeys(label for found in cases.values() for label in found))
-        for i, (label, style) in enumerate(zip(labels, plt.rcParams["axes.prop_cycle"])):
-            at = [y for y, found in enumerate(cases.values()) if label in found]
-            means, errors = zip(*(found[label] for found in cases.values() if label in found))
-            ax.errorbar(means, np.array(at) + 0.2 * (i - (len(labels) - 1) / 2), xerr=errors,
-                        fmt="os^"[i], color=style["color"], label=label)
-        ax.axvline(0, color="black", linewidth=0.8)
-        ax.set(title=title, xlabel=xlabel, yticks=range(len(cases)), yticklabels=cases)
-        ax.invert_yaxis()
-        handles.update((label, handle) for handle, label in zip(*ax.get_legend_handles_labels()))
-    figure.legend(handles.values(), handles, loc="outside lower center", ncols=3)
-    plots.drawn(plots.save_figure, path, figure)
+    height = 1.5 + 0.28 * max(map(len, panels.values()))
+    with plots.panels(path, len(panels), 3, 5.5, height) as grid:
+        for ax, (title, cases) in zip(grid, panels.items()):
+            labels = list(dict.fromkeys(label for found in cases.values() for label in found))
+            for i, label in enumerate(labels):
+                at = [y for y, found in enumerate(cases.values()) if label in found]
+                means, errors = zip(*(found[label] for found in cases.values() if label in found))
+                ax.errorbar(means, np.array(at) + 0.2 * (i - (len(labels) - 1) / 2), xerr=errors,
+                            fmt="os^"[i], color=f"C{i}", label=label)
+            ax.axvline(0, color="black", linewidth=0.8)
+            ax.set(title=title, xlabel=xlabel, yticks=range(len(cases)), yticklabels=cases)
+            ax.invert_yaxis()
 
 
 # -------------------------------------------------------------------- Figure 7: equal return
@@ -217,13 +197,11 @@ def difference_cell(one, other):
 def draw_bars(path, cells, kinds):
     """Bars of the return with each action dimension disturbed, {task: {case: {(kind, joint):
     returns}}}; lines across: undisturbed, ("none", 0)."""
-    plt = plots.pyplot()
-    figure, grid = plt.subplots(len(cells), len(kinds), squeeze=False, layout="constrained",
-                                figsize=(11, 2.8 * len(cells)), sharey="row")
-    for row, (task, cases) in zip(grid, cells.items()):
-        actions = fac.lookup_task(task)[1]
-        for ax, kind in zip(row, kinds):
-            for i, (case, values) in enumerate(sorted(cases.items())):
+    panels = [(task, kind) for task in cells for kind in kinds]
+    with plots.panels(path, len(panels), len(kinds), 3.7, 2.8, sharey="row") as grid:
+        for ax, (task, kind) in zip(grid, panels):
+            actions = fac.lookup_task(task)[1]
+            for i, (case, values) in enumerate(sorted(cells[task].items())):
                 joints = sorted(j for k, j in values if k == kind)
                 ax.bar(np.array(joints) + 0.27 * (i - 1),
                        [np.mean(values[kind, j]) for j in joints], 0.25, label=case,
@@ -234,5 +212,3 @@ def draw_bars(path, cells, kinds):
             what = "one action is noise" if kind == "noise" else f"one motor x {kind}"
             ax.set(title=f"{task}: {what}", xlabel="action dimension", ylabel="episode return",
                    xticks=range(0, actions, 1 + actions // 20))
-    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    plots.drawn(plots.save_figure, path, figure)
