@@ -828,6 +828,7 @@ class DistillConfig(Algorithm1Config):
 # how a student with priors plans, where no flag says otherwise and no search was chosen
 STUDENT_PLANNING = {"prior": "own", "max_std": 0.15, "samples": 16, "iterations": 1,
                     "output": "mean"}
+ALONE = {"prior": "own", "iterations": 0}  # of a PlannerConfig: priors, or a policy, act
 SEARCH = [f.name for f in dataclasses.fields(PlannerConfig)  # what a student's file says of it
           if f.name not in ("horizon", "discount", "speed", "action_repeat")]
 CHOSEN = "max_std", "samples", "iterations"  # by playing, of: none, a narrow search, a wide one
@@ -1927,7 +1928,7 @@ def expert_episodes(distiller, task, config, workers=None, environment=None):
     """What `Distiller.add` takes: episodes in which the expert's policy acts, each with noise of
     another deviation [D8]. config: a PlannerConfig; workers, environment: as `play`'s."""
     seeds = training_seeds(distiller.seed, "expert episode", 0, distiller.config.expert_episodes)
-    policy = dataclasses.replace(config, prior="own", iterations=0)
+    policy = dataclasses.replace(config, **ALONE)
     return play(distiller.expert, task, policy, seeds, workers, "the expert plays", environment,
                 EXPERT_NOISE)[:2]
 
@@ -1944,7 +1945,7 @@ def teach_priors(distiller, task, planning, workers=None, environment=None):
     search (`planning`) finds in as many. Returns their weights, {"policy": ..., "plans": ...}."""
     student, config = distiller.student, distiller.config
     L, episodes = config.horizon + 1, -(-config.expert_episodes // 8)
-    reflex = dataclasses.replace(planning, prior="own", iterations=0)
+    reflex = dataclasses.replace(planning, **ALONE)
 
     def own_states(number, teacher=None):
         seeds = training_seeds(distiller.seed, "prior episode", number * 6 * episodes, 6 * episodes)
@@ -2019,7 +2020,7 @@ def choose_by_playing(distiller, task, taught, plannings, workers=None, environm
                        "returns": found.tolist()})
         return found
 
-    reflex = dataclasses.replace(plannings[-1], iterations=0)
+    reflex = dataclasses.replace(plannings[-1], **ALONE)
     alone = {name: returns(name, reflex) for name in taught if seeds}
     best = max(alone, key=lambda name: alone[name].mean(), default=[*taught][-1])
     student.params.update(taught[best])
@@ -2302,9 +2303,9 @@ def compared(expert, student):
     (model, own), (learner, planning) = expert, student
     found = {"expert": expert}
     if model.has_policy:
-        found["policy"] = model, dataclasses.replace(own, prior="own", iterations=0)
+        found["policy"] = model, dataclasses.replace(own, **ALONE)
     if planning.prior == "own" and planning.iterations:
-        found["reflex"] = learner, dataclasses.replace(planning, iterations=0)
+        found["reflex"] = learner, dataclasses.replace(planning, **ALONE)
     return {**found, "student": student}
 
 

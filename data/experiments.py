@@ -60,9 +60,6 @@ def run_all(args, function, runs):
                     getattr(args, "scheduler", None))
 
 
-ALONE = {"prior": "own", "iterations": 0}  # of a PlannerConfig: a policy, or priors, act
-
-
 def planning_for(header, about):
     """A model's own planning but for what a run's settings say of it."""
     own = {k: about[k] for k in ("horizon", *fac.STUDENT_PLANNING) if k in about}
@@ -105,7 +102,7 @@ def distil(task, seed, case, settings):
         if not environment:  # others' ranks are of the robot's actions
             q, g = distiller.ranks(256, planning.discount)
             row.update(rank_q=float(q[0]), rank_return=float(g[-1]))
-    reflex, policy = (dataclasses.replace(of, **ALONE)
+    reflex, policy = (dataclasses.replace(of, **fac.ALONE)
                       for of in (planning, planning_for(header, {})))
     for of in evaluation_seeds:
         row.update(measure(student, task, planning, count, of, environment))
@@ -373,7 +370,7 @@ def plan_with(task, seed, case, settings, folder):
     model, header = load_same(task, seed, case, settings, folder)
     planning = planning_for(header, settings)
     if case == "policy":
-        planning = dataclasses.replace(planning, **ALONE)
+        planning = dataclasses.replace(planning, **fac.ALONE)
     environment = (DisturbedEnvironment(task, settings["joint"], settings["kind"],
                                         planning.action_repeat) if settings.get("kind") else None)
     for evaluation_seed in students.EVALUATION_SEEDS:
@@ -474,7 +471,7 @@ def plan_like_authors(task, seed, case, settings, folder):
     times = student.config.num_agents if sharp else 1  # heads are summed here, averaged there
     planning = fac.PlannerConfig(**own, pi_trajs=proposals, output=output, inverse_temperature=(
         times * fac.PlannerConfig.inverse_temperature))
-    policy = fac.PlannerConfig(**{**fac.made_for(theirs, "expert"), **ALONE})
+    policy = fac.PlannerConfig(**{**fac.made_for(theirs, "expert"), **fac.ALONE})
     for evaluation_seed in students.EVALUATION_SEEDS:
         found = measure(expert, task, policy, settings["episodes"], evaluation_seed)
         with AuthorsPlanner(student, expert, planning) as planner:

@@ -92,7 +92,7 @@ def collect(checkpoint, task, episodes, seed, folder):
              "versions": fac.software()}
     path = folder / f"collected-{experiments.crc(about):08x}" / task / "replay.npz"
     if not path.exists():
-        planning = fac.PlannerConfig(**experiments.ALONE)
+        planning = fac.PlannerConfig(**fac.ALONE)
         path.parent.mkdir(parents=True, exist_ok=True)
         import_expert.collect(checkpoint.teacher(task), planning, fac.make_robot(task), episodes,
                               seed)[0].write(path, {**about, "task": task})
@@ -221,7 +221,7 @@ def command_evaluate(args):
                                                          args.seed, args.workers)
         found[task]["policy_returns"] = teacher_returns(
             expert, own, path, args.episodes, args.seed, args.workers,
-            **experiments.ALONE) if expert.has_policy else []
+            **fac.ALONE) if expert.has_policy else []
         found[task]["kept"] = fac.return_kept(*(np.mean(found[task][key]) for key in (
             "returns", "teacher_returns")))
     rows = [[np.mean(of[key]) if of[key] else np.nan for key in (
@@ -294,7 +294,7 @@ def play_marks(task, seed, case, settings, folder, data):
     own = fac.made_for(header, path)
     if case in (TEACHER, POLICY):
         returns = teacher_returns(expert, header, path, episodes, 0,
-                                  **(experiments.ALONE if case == POLICY else {}))
+                                  **(fac.ALONE if case == POLICY else {}))
         yield {"step": steps, **experiments.of_returns(returns, 0)}
     else:
         planning = fac.PlannerConfig(**{**own, "horizon": settings["horizon"], **(
