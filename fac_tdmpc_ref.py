@@ -968,6 +968,33 @@ def compact(rows):
     return half if (moved <= 0.01 * apart).all() else rows
 
 
+def thread_pool(threads):
+    """Threads that go on where NumPy, however a caller has set it, would raise."""
+    return ThreadPoolExecutor(threads, "", lambda: np.seterr(all="ignore"))
+
+
+class Halves:
+    """A batch's two halves, each learned by one of two threads, into a gradient of its own."""
+
+    def __init__(self, optimizer, threads):
+        self.optimizer, self.threads = optimizer, threads
+        self.gradients = [flatten(optimizer.params) for _ in range(2)]
+
+    def learn(self, size, loss):
+        """The optimizer's gradient of the mean of loss(part, grads) over `size`; that mean."""
+        def fill(gradient, part):
+            (vector, grads), fraction = gradient, (part.stop - part.start) / size
+            vector[:] = 0
+            losses = loss(part, grads)
+            vector *= vector.dtype.type(fraction)
+            return fraction * np.array(losses)
+
+        parts = slice(0, size // 2), slice(size // 2, size)
+        losses = sum(self.threads.map(fill, self.gradients, parts))
+        np.add(*(vector for vector, _ in self.gradients), out=self.optimizer.gradient)
+        return losses
+
+
 POOL, PART = 4096, 32  # states that the expert predicts at once, and a thread's part of them
 EXPERT_NOISE = 0.6  # largest deviation of the noise in episodes that its policy plays [D8]
 
@@ -1008,8 +1035,8 @@ class Distiller:
         with one_thread():
             self.optimizer, self.student = self.create(expert, sizes, seed)
         self._number = None
-        self._threads = ThreadPoolExecutor(min(4, cores()), "", lambda: np.seterr(all="ignore"))
-        self._halves = [flatten(self.optimizer.params) for _ in range(2)]  # a batch's two gradients
+        self._threads = thread_pool(min(4, cores()))
+        self._halves = Halves(self.optimizer, self._threads)
 
     def draw(self, number, part, size):
         """Lines 4 and 6 (expert), `size` states, part `part` of a pool; as `perturb` returns."""
@@ -1052,25 +1079,9 @@ class Distiller:
 
         with one_thread():
             features, actions, targets = self.batch(self.t)
-            losses = self.learn(self.optimizer, self._halves, self.config.batch_size, loss)
+            losses = self._halves.learn(self.config.batch_size, loss)
             self.optimizer.step(learning_rate(self.config, self.t), self.config.grad_clip)
         return tuple(losses.tolist())
-
-    def learn(self, optimizer, halves, size, loss):
-        """Two threads: an optimizer's gradient of the mean of loss(part, grads) over a batch of
-        this size, of which a part is half; each fills its own of `halves`, (vector, views)."""
-        parts = slice(0, size // 2), slice(size // 2, size)
-
-        def fill(half, part):
-            (gradient, grads), fraction = half, (part.stop - part.start) / size
-            gradient[:] = 0
-            losses = loss(part, grads)
-            gradient *= gradient.dtype.type(fraction)
-            return fraction * np.array(losses)
-
-        losses = sum(self._threads.map(fill, halves, parts))
-        np.add(*(gradient for gradient, _ in halves), out=optimizer.gradient)
-        return losses
 
     def in_parts(self, function, obs):
         """What a function makes of many observations (O, M), by the threads: (..., M)."""
@@ -1989,7 +2000,7 @@ def learn_priors(distiller, data, number):
                                  steps=-(-distiller.config.steps // 4))
     adam = Adam(prior_weights(student))
     student.params.update(adam.params)  # views of its vector
-    halves = [flatten(adam.params) for _ in range(2)]
+    halves = Halves(adam, distiller._threads)
 
     def loss(part, grads):
         rows = chosen[part]
@@ -1998,7 +2009,7 @@ def learn_priors(distiller, data, number):
     with one_thread(), progress("teaching priors", config.steps, "step") as bar:
         for t in range(config.steps):
             chosen = rng.integers(x.shape[-1], size=PRIOR_BATCH)
-            found = distiller.learn(adam, halves, PRIOR_BATCH, loss)
+            found = halves.learn(PRIOR_BATCH, loss)
             adam.step(learning_rate(config, t), config.grad_clip)
             bar.update()
     check_finite("priors' loss is", found, config.steps, config.lr)

@@ -19,7 +19,7 @@ class ExpertConfig(fac.Settings):
     mlp_dim: int = fac.field(512, "hidden width of the other networks (Table 2)", least=1)
     horizon: int = fac.field(3, "H: steps of the latent rollout (Table 2)", least=1,
                              most=fac.EPISODE_STEPS)
-    batch_size: int = fac.field(512, "segments in an update (Table 2)", least=1)
+    batch_size: int = fac.field(512, "segments in an update (Table 2)", least=2)
     updates_per_step: float = fac.field(1.0, "updates for each decision", least=0)
     lr: float = fac.field(5e-4, "Adam's learning rate (authors' expert)", above=0)
     discount: float = fac.field(0.99, "gamma (Table 2)", least=0, most=1)
@@ -140,26 +140,41 @@ class Learner:
                                             **self.policy_optimizer.params})
         self.slow_vector, slow = fac.flatten(self.optimizer.params)
         self.target = fac.WorldModel(sizes, slow)
+        threads = fac.thread_pool(2)
+        self._fit = fac.Halves(self.optimizer, threads)
+        self._improve = fac.Halves(self.policy_optimizer, threads)
 
     @fac.one_thread()
     def update(self, obs, actions, reward, rng, continues=1.0):
-        """One step of Equation 1, one of the policy; every `target_every` times the averages.
+        """One step of Equation 1, one of the policy; every `target_every` times the averages. Two
+        threads take half of the batch each.
 
         obs (H + 1, O, B), actions (H, A, B), reward (H, B); continues (H, B): 0 where the next
         state ended the episode, whose value is zero, else 1. Returns the terms of Equation 1."""
         config, (steps, dim_action, batch) = self.config, actions.shape
         noise = fac.policy_noise((dim_action, 2 * steps + 1, batch), rng)
-        latents, td = td_targets(self.model, self.target, obs[1:], reward,
-                                 noise[:, :steps].reshape(dim_action, -1),
-                                 config.discount * continues)
-        _, terms, rollout = equation_1(self.model, obs[0], actions, reward, latents, td, config,
-                                       self.optimizer.grads)
+        discount, rollouts = np.full_like(reward, config.discount * continues), {}
+
+        def fit(part, grads):
+            latents, td = td_targets(self.model, self.target, obs[1:, :, part], reward[:, part],
+                                     noise[:, :steps, part].reshape(dim_action, -1),
+                                     discount[:, part])
+            _, terms, rollouts[part.start] = equation_1(
+                self.model, obs[0][:, part], actions[..., part], reward[:, part], latents, td,
+                config, grads)
+            return terms
+
+        def improve(part, grads):
+            return policy_loss(self.model, rollouts[part.start], noise[:, steps:, part],
+                               config.lam, grads)
+
+        terms = self._fit.learn(batch, fit)
         self.optimizer.step(config.lr, config.grad_clip)
-        policy_loss(self.model, rollout, noise[:, steps:], config.lam, self.policy_optimizer.grads)
+        self._improve.learn(batch, improve)
         self.policy_optimizer.step(config.lr, config.grad_clip)
         if self.updates % config.target_every == 0:  # averages += tau (weights - averages)
             self.slow_vector += config.tau * (self.optimizer.vector - self.slow_vector)
-        return terms
+        return terms.tolist()
 
     @property
     def updates(self):

@@ -263,6 +263,18 @@ class TorchDistiller:
         return loss.item()
 
 
+@contextlib.contextmanager
+def on_cores(threads):
+    """Inside, this process has so many cores, and PyTorch as many threads."""
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, list(cores)[:threads])
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)
+
+
 def distillation(threads, turns):
     """(ratio, our ms, PyTorch's ms) of a distillation step: reacher-hard, Algorithm 1 with default
     sizes, on one core, or two. Both compute the expert's predictions for every step: ours has a
@@ -270,30 +282,24 @@ def distillation(threads, turns):
     """
     expert, _ = fac.load_model(fac.data_file("reacher-hard", "expert.npz"))
     replay = fac.Replay(fac.data_file("reacher-hard", "replay.npz"))
-    cores = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, list(cores)[:threads])
-    torch.set_num_threads(threads)
-    try:
-        config = fac.DistillConfig(targets="joint", policy_share=0.0, reuse=1)
-        with contextlib.closing(fac.Distiller(expert, replay, config)) as ours:
-            ours.pool_size = 20 * config.batch_size
-            theirs = TorchDistiller(ours, replay)
-            return ratios(lambda: [ours.step() for _ in range(20)],
-                          lambda: [theirs.step() for _ in range(20)], turns)
-    finally:
-        os.sched_setaffinity(0, cores)
+    config = fac.DistillConfig(targets="joint", policy_share=0.0, reuse=1)
+    with on_cores(threads), contextlib.closing(fac.Distiller(expert, replay, config)) as ours:
+        ours.pool_size = 20 * config.batch_size
+        theirs = TorchDistiller(ours, replay)
+        return ratios(lambda: [ours.step() for _ in range(20)],
+                      lambda: [theirs.step() for _ in range(20)], turns)
 
 
 def training(threads, turns, batch=256):
     """(ratio, our ms, PyTorch's ms) of an update of Equation 1, policy and averages included."""
     config, rng = numpy_learner.ExpertConfig(batch_size=batch), np.random.default_rng(0)
-    ours = numpy_learner.Learner(fac.ModelConfig(24, 6), config, rng)
-    theirs = TorchLearner(fac.WorldModel.create(ours.model.config, rng, policy=True), config, "cpu")
     obs = rng.standard_normal((4, 24, batch), np.float32)
     reward = rng.random((3, batch), np.float32)
     actions = rng.uniform(-1, 1, (3, 6, batch)).astype(np.float32)
-    torch.set_num_threads(threads)
-    with fac._thread_pools().limit(limits=threads, user_api="blas"):
+    with on_cores(threads):
+        ours = numpy_learner.Learner(fac.ModelConfig(24, 6), config, rng)
+        theirs = TorchLearner(fac.WorldModel.create(ours.model.config, rng, policy=True), config,
+                              "cpu")
         return ratios(*(lambda learner=learner: learner.update(obs, actions, reward, rng)
                         for learner in (ours, theirs)), turns)
 

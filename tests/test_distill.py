@@ -92,7 +92,7 @@ def test_same_seed_same_student(replay, steps):
 
 
 def go_on(distiller, steps):
-    distiller._threads = fac.ThreadPoolExecutor(3)
+    distiller._threads = distiller._halves.threads = fac.ThreadPoolExecutor(3)
     with fac.one_thread():  # it was closed before
         for _ in range(steps):
             distiller.step()
@@ -286,7 +286,7 @@ def test_the_number_of_threads_changes_no_bit(replay, monkeypatch):
     for threads in (1, 2, 4):
         with fresh(replay, config) as distiller:
             distiller._threads.shutdown()
-            distiller._threads = fac.ThreadPoolExecutor(threads)
+            distiller._threads = distiller._halves.threads = fac.ThreadPoolExecutor(threads)
             losses = [distiller.step() for _ in range(15)]
             found.append((losses, distiller.optimizer.vector.tobytes()))
     assert found[0] == found[1] == found[2]

@@ -159,6 +159,18 @@ def test_a_learner_goes_on_where_numpy_is_set_to_raise():
         assert np.isfinite(learner.update(1e4 * obs, *more, rng)).all()
 
 
+def test_an_update_s_bits_are_the_same_by_one_thread_or_two():
+    found = []
+    for threads in (1, 2):
+        learner = small_learner(np.random.default_rng(6), np.float32)
+        learner._fit.threads = learner._improve.threads = fac.thread_pool(threads)
+        for t in range(3):
+            learner.update(*small_batch(np.random.default_rng(t), dtype=np.float32),
+                           np.random.default_rng(t))
+        found.append({k: v.tobytes() for k, v in learner.state().items()})
+    assert found[0] == found[1]
+
+
 def test_a_learner_goes_on_from_its_state():
     """Weights, both of Adam's means, steps made and moving averages."""
     first, second = (small_learner(np.random.default_rng(seed), np.float32) for seed in (6, 7))
