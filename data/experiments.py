@@ -730,8 +730,8 @@ def report_alone(_, path, figures):
 
 
 def report_capacity(_, path, figures):
-    """One model for all joints beside a model for each; the figure: what the first two searches
-    win against milliseconds, in the episodes of the choice."""
+    """One model for all joints beside a model for each; the figure: what each search wins
+    against milliseconds, in the episodes of the choice."""
     rows = settled_rows(path)
     tasks = list(dict.fromkeys(row["task"] for row in rows))
     rows.sort(key=lambda row: (tasks.index(row["task"]), row["case"] != "default"))

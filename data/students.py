@@ -279,8 +279,7 @@ def played_by_search(row):
 def capacity_table(lines):
     """One model for all joints beside a model for each, taught alike: what searching wins over the
     priors is of the episodes by which a student chose. lines: `by_line`'s, of every task some that
-    `time_models` timed. Markdown, and panels of what the first two searches win against
-    milliseconds."""
+    `time_models` timed. Markdown, and panels of what each search wins against milliseconds."""
     timed, found, panels = {}, [], {}
     for row in (by_seed[min(by_seed)][0] for by_seed in lines.values()):
         if ms := json.loads(row["ranks"]).get("ms_by_search"):
@@ -289,7 +288,7 @@ def capacity_table(lines):
         rows, first = sum(by_seed.values(), []), by_seed[min(by_seed)]
         task, case, settings = first[0]["task"], first[0]["case"], json.loads(first[0]["settings"])
         _, error = difference(by_seed, over="expert_returns")
-        ms = timed.get((task, case), ())[:3]  # a fourth takes as long as the third
+        ms = timed.get((task, case), ())
         sizes = sizes_of(task, settings["num_agents"], settings.get("mlp_dim"))
         by_search = [*map(played_by_search, first)]  # of each student
         played = np.stack([[*of.values()] for of in by_search], 1)  # (searches, students, episodes)
@@ -306,7 +305,7 @@ def capacity_table(lines):
             x: (of - played[0]).mean(1).tolist() for x, of in zip(ms, played)}
     names = [*by_search[0]]  # all lines' alike
     searched = [f"{name} - priors" for name in names[1:]]
-    budgets = " / ".join(name.split(",")[0] for name in names[:3])
+    budgets = " / ".join(name.split(",")[0] for name in names)
     return markdown(["task", "models", "width", "weights", "students", "expert", "student",
                      "priors", *searched, "rank of G, H = 0 / last", f"ms: {budgets}",
                      "minutes, least"], found), panels
