@@ -330,19 +330,17 @@ def main():
     result["central_ratio"] = show("plan, TD-MPC (N = 1, latent 512)", planning(1, 6, args.turns))
     for n in (3, 6, 12, 21):
         result["fac_ratio"][str(n)] = show(f"plan, Fac-TDMPC (N = {n})", planning(n, n, args.turns))
-    cores = os.sched_getaffinity(0)
     for threads in (1, 2):
-        if threads <= len(cores):
+        if threads <= fac.cores():
             result["distill_ratio"][str(threads)] = show(
                 "distillation step", distillation(threads, args.turns), threads)
             result["update_ratio"][str(threads)] = show(
                 "update of TD-MPC (batch 256)", training(threads, args.turns), threads)
-    os.sched_setaffinity(0, list(cores)[:1])  # JAX's own threads, too, begin on this one core
-    for n in (1, 6, 21):
-        found = planning(n, max(n, 6), args.turns, jax=True)
-        if found:
-            result["jax_ratio"][str(n)] = show(f"plan, N = {n}, jax.jit", found, peer="JAX    ")
-    os.sched_setaffinity(0, cores)
+    with on_cores(1):  # JAX's own threads, too, begin on this one core
+        for n in (1, 6, 21):
+            found = planning(n, max(n, 6), args.turns, jax=True)
+            if found:
+                result["jax_ratio"][str(n)] = show(f"plan, N = {n}, jax.jit", found, peer="JAX    ")
     for n in (1, 6):
         try:
             show(f"plan, N = {n}, torch.compile", planning(n, 6, args.turns, compiled=True))
